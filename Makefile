@@ -1,0 +1,53 @@
+# `make help` lists what can be asked for. The plain commands behind each target stand in README.
+PYTHON ?= python3
+SEEDS ?= 1
+CORES ?= 2
+VENV := .venv
+BIN := $(VENV)/bin
+# One thread a process: stages run side by side, and results must not depend on how many.
+export OMP_NUM_THREADS := 1
+export MKL_NUM_THREADS := 1
+export OPENBLAS_NUM_THREADS := 1
+export MPLBACKEND := agg
+SNAKEMAKE = $(BIN)/python -m snakemake --profile profiles/local --cores $(CORES)
+
+.PHONY: help setup reports smoke test lab publish notebooks clean
+
+help:  ## show this list
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-10s %s\n", $$1, $$2}'
+	@echo "Settings: SEEDS=20 CORES=2 PYTHON=python3.12"
+
+setup: $(VENV)/installed  ## create .venv and install environment.txt
+
+$(VENV)/installed: environment.txt pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --requirement environment.txt
+	$(BIN)/python -m pip install --quiet --no-deps --editable .
+	touch $@
+
+reports: setup  ## run everything at paper scale and write reports/latest/report.html
+	$(SNAKEMAKE) --config seeds=$(SEEDS) scale=paper
+	@echo "The report: $(CURDIR)/reports/latest/report.html"
+
+smoke: setup  ## the same in seconds, with few epochs; the report goes to results/smoke/report/
+	$(SNAKEMAKE) --config seeds=1 scale=smoke reports=results/smoke/report
+	@echo "The report of the smoke run: $(CURDIR)/results/smoke/report/report.html"
+
+test: setup  ## style, types, layers, tests and the notebooks against their stored outputs
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff format --check .
+	$(BIN)/python -m mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m pytest --nbval notebooks tests
+
+lab: setup  ## open JupyterLab on the notebooks
+	$(BIN)/python -m jupyter lab notebooks
+
+publish: setup  ## copy reports/latest to reports/reference
+	$(BIN)/python -m helpers.publish
+
+notebooks: setup  ## run the notebooks at their defaults and store the outputs in them
+	$(BIN)/python -m helpers.refresh
+
+clean:  ## remove results and the last report
+	rm -rf results reports/latest .snakemake

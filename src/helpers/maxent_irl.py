@@ -1,0 +1,154 @@
+"""Algorithm 2: maximum-entropy inverse reinforcement learning of the reward weights, with Algorithm 1 inside."""
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from helpers.evaluation import expected_features, feature_gap, relative_gap
+from helpers.features import FeatureMap, linear_reward
+from helpers.params import WeightParams
+from helpers.policy import LSTMPolicy, PolicyController
+from helpers.reinforce import Learner, TrainingError, reinforce
+from helpers.trajectories import Trajectories
+
+
+def maxent_gradient(expert_features: Tensor, policy_features: Tensor) -> Tensor:
+    """Gradient of the mean log-likelihood of the demonstrations in alpha, Eq. 3.4.4-3.4.5: v_E - E[v_pi], shape (d,)."""
+    return expert_features - policy_features
+
+
+def project(weights: Tensor) -> Tensor:
+    """The weights at unit Euclidean norm."""
+    return weights / weights.norm()
+
+
+def initial_weights(params: WeightParams, n_loops: int, dtype: torch.dtype) -> Tensor:
+    """alpha before the first iteration, shape (d,): one sign for each kind of feature, of unit norm."""
+    return project(torch.tensor(params.initial, dtype=dtype).repeat_interleave(n_loops))
+
+
+class WeightAscent:
+    """Gradient ascent on the log-likelihood of the demonstrations, Eq. 3.4.6, clipped and then of unit norm.
+
+    lambda <- clip((1 - decay) lambda + kappa D grad), alpha = lambda / |lambda|. With decay = 0 and D = I this is the
+    printed step. A decay is a Gaussian prior on the weights (their log-density adds -decay/(2 kappa) |lambda|^2): old
+    evidence fades, which damps the swinging of alpha about a policy that already matches. D = diag(1/|v_E|) measures
+    each feature in units of the expert's own value.
+    """
+
+    def __init__(self, params: WeightParams, start: Tensor, expert_features: Tensor) -> None:
+        self.params = params
+        self.raw = start.clone()
+        self.weights = project(start)
+        self.mean = self.weights.clone()
+        self.metric = 1 / expert_features.abs() if params.scaled_by_expert else torch.ones_like(start)
+
+    def step(self, gradient: Tensor) -> None:
+        """One step along the gradient, shape (d,)."""
+        params = self.params
+        raw = (1 - params.decay) * self.raw + params.step * self.metric * gradient
+        self.raw = raw.clamp(-params.bound, params.bound)
+        self.weights = project(self.raw)
+        self.mean = params.averaging * self.mean + (1 - params.averaging) * self.weights
+
+    @property
+    def result(self) -> Tensor:
+        """alpha*: the running mean of the weights over the iterations, of unit norm."""
+        return project(self.mean)
+
+
+def apprentice_reward(trajectories: Trajectories, features: FeatureMap, weights: Tensor) -> Tensor:
+    """R_1..R_T of Eq. 4.2.5 along trajectories, shape (T, K)."""
+    return linear_reward(features.state(trajectories), weights)
+
+
+@dataclass(frozen=True)
+class IterationRecord:
+    """One outer iteration of Algorithm 2: what it cost so far, how near the policy came, under which weights.
+
+    Episodes count those that were rolled out to measure the features as well as those learned from.
+    """
+
+    iteration: int
+    epochs: int
+    episodes: int
+    gradient_steps: int
+    mean_return: float
+    feature_gap: float
+    learning_rate: float
+    policy_std: float
+    weights: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Apprenticeship:
+    """The result of Algorithm 2: alpha*, the learned policy, the epoch it was taken from, and how it came about."""
+
+    weights: Tensor
+    policy: LSTMPolicy
+    chosen_epoch: int
+    records: tuple[IterationRecord, ...]
+
+
+def maxent_irl(
+    learner: Learner,
+    expert_features: Tensor,
+    start: Tensor,
+    params: WeightParams,
+    n_iterations: int,
+    n_measured: int,
+    report: Callable[[IterationRecord], None] = lambda record: None,
+) -> Apprenticeship:
+    """Algorithm 2: policy optimisation, Monte Carlo evaluation, gradient, ascent; `n_iterations` times.
+
+    The epochs of the learner are shared evenly among the iterations. With as many iterations as epochs, the weights
+    move a little after every epoch.
+
+    Args:
+        expert_features: v_E, the mean trajectory features of the demonstrations, shape (d,).
+        start: alpha before the first iteration, shape (d,).
+        n_measured: episodes of the deployed policy (its mode) that estimate E[v_pi] in each iteration.
+        report: called with the record of each iteration as it ends.
+
+    Raises:
+        TrainingError: if the return, the gradient or the features are not finite.
+    """
+    features = learner.features
+    ascent = WeightAscent(params, start, expert_features)
+    smoothed = torch.zeros_like(expert_features)
+    records: list[IterationRecord] = []
+    nearest, best_gap, chosen = learner.average, float("inf"), 0
+    for iteration in range(1, n_iterations + 1):
+        n_epochs = learner.total_epochs * iteration // n_iterations - learner.total_epochs * (iteration - 1) // n_iterations
+        alpha = ascent.weights
+        reward = partial(apprentice_reward, features=features, weights=alpha)
+        epochs = reinforce(learner, reward, n_epochs, learner.params.patience)
+        controller = PolicyController(learner.policy, features.task, exploring=False)
+        measured = expected_features(learner.process, controller, features, n_measured, learner.generator)
+        learner.episodes += n_measured
+        if not torch.isfinite(measured.mean).all():
+            raise TrainingError(f"epoch {learner.epochs}: the trajectory features of the policy are not finite")
+        ascent.step(maxent_gradient(expert_features, measured.mean))
+        gap = relative_gap(measured.mean, expert_features)
+        smoothed = gap if iteration == 1 else params.selection_memory * smoothed + (1 - params.selection_memory) * gap
+        if smoothed.abs().mean() < best_gap or not params.keep_nearest:
+            nearest, best_gap, chosen = copy.deepcopy(learner.average), smoothed.abs().mean().item(), learner.epochs
+        records.append(
+            IterationRecord(
+                iteration=iteration,
+                epochs=learner.epochs,
+                episodes=learner.episodes,
+                gradient_steps=learner.gradient_steps,
+                mean_return=epochs[-1].mean_return,
+                feature_gap=feature_gap(measured.mean, expert_features),
+                learning_rate=epochs[-1].learning_rate,
+                policy_std=epochs[-1].policy_std,
+                weights=tuple(alpha.tolist()),
+            )
+        )
+        report(records[-1])
+    return Apprenticeship(ascent.result, nearest, chosen, tuple(records))

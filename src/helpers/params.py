@@ -1,0 +1,420 @@
+"""Validated, frozen records of the parameter files.
+
+A leaf of a parameter file is a mapping {value, unit, source, status}; the records hold the bare values, checked for type,
+unit and range, and `leaves` lists them all for the report. Whatever is wrong with a file is one sentence that names
+the file, the key and what was expected.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, Strict, ValidationError, model_validator
+from pydantic_core import PydanticCustomError, core_schema
+from ruamel.yaml import YAML
+from ruamel.yaml.constructor import DuplicateKeyError
+from ruamel.yaml.error import MarkedYAMLError
+
+LEAF_KEYS = ("value", "unit", "source", "status")
+STATUSES = ("reported", "inferred", "assumed")
+
+
+class ParameterError(ValueError):
+    """A parameter file is unusable; the message is one sentence that names the file and the key."""
+
+    def _render_traceback_(self) -> list[str]:
+        """What IPython shows: the sentence alone."""
+        return [f"{type(self).__name__}: {self}"]
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """Marks a field whose entry in the file is {value, unit, source, status}, with the unit it must be given in."""
+
+    unit: str
+
+    def unwrap(self, entry: Any) -> Any:
+        """The value of a leaf, once its keys, unit and status are right."""
+        if not isinstance(entry, dict):
+            raise PydanticCustomError("leaf", "expected a leaf with the keys value, unit, source, status")
+        for key in LEAF_KEYS:
+            if key not in entry:
+                raise PydanticCustomError("leaf", "the leaf lacks the key '{key}'", {"key": key})
+        for key in entry:
+            if key not in LEAF_KEYS:
+                raise PydanticCustomError("leaf", "the leaf has the unknown key '{key}'", {"key": str(key)})
+        if entry["unit"] != self.unit:
+            raise PydanticCustomError(
+                "leaf", "expected the unit '{expected}', found '{found}'", {"expected": self.unit, "found": str(entry["unit"])}
+            )
+        if entry["status"] not in STATUSES:
+            raise PydanticCustomError(
+                "leaf", "expected a status of reported, inferred, assumed, found '{found}'", {"found": str(entry["status"])}
+            )
+        if not isinstance(entry["source"], str) or not entry["source"]:
+            raise PydanticCustomError("leaf", "expected a source in words")
+        return entry["value"]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        return core_schema.no_info_before_validator_function(self.unwrap, handler(source))
+
+
+def _not_zero(value: float) -> float:
+    if value == 0:
+        raise PydanticCustomError("zero", "expected a number other than zero")
+    return value
+
+
+EPISODES_PER_EPOCH = 500  # the size of the paper's batch of demonstrations; no epoch may draw more
+DEVIATION = "deviation, unit not given"
+Real = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+Positive = Annotated[Real, Field(gt=0)]
+NotNegative = Annotated[Real, Field(ge=0)]
+Count = Annotated[int, Strict(), Field(gt=0)]
+Text = Annotated[str, Strict(), Field(min_length=1)]
+Vector = Annotated[tuple[Real, ...], Field(min_length=1)]
+Share = Annotated[Positive, Field(le=1)]
+Memory = Annotated[NotNegative, Field(lt=1)]
+NotZero = Annotated[Real, AfterValidator(_not_zero)]
+Matrix = Annotated[tuple[Vector, ...], Field(min_length=1)]
+
+
+class Record(BaseModel):
+    """A frozen record that refuses unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+def _same_length(expected: int, record: BaseModel, *names: str) -> None:
+    for name in names:
+        if len(getattr(record, name)) != expected:
+            raise PydanticCustomError(
+                "length",
+                "'{name}' has {found} entries, expected {expected}",
+                {"name": name, "found": len(getattr(record, name)), "expected": expected},
+            )
+
+
+R = TypeVar("R", bound=Record)
+
+
+class BalanceParams(Record):
+    """The groups of the material and energy balance behind Eq. 4.1.3b."""
+
+    dilution_rate: Annotated[Positive, Leaf("1/time")]
+    rate_constant: Annotated[Positive, Leaf("1/time")]
+    heat_exchange: Annotated[Positive, Leaf("1/time")]
+    reaction_heat: Annotated[Positive, Leaf("temperature/concentration")]
+    rate_sensitivity: Annotated[Positive, Leaf("concentration/(time temperature)")]
+
+
+class ProcessParams(Record):
+    """params/process.yaml: Section 4.1."""
+
+    controlled: Annotated[tuple[Text, ...], Leaf("-")]
+    manipulated: Annotated[tuple[Text, ...], Leaf("-")]
+    controlled_description: Annotated[tuple[Text, ...], Leaf("-")]
+    manipulated_description: Annotated[tuple[Text, ...], Leaf("-")]
+    drift_state: Annotated[Matrix, Leaf("1/time")]
+    drift_input: Annotated[Matrix, Leaf("1/time")]
+    disturbance: Annotated[Vector, Leaf("1/sqrt(time)")]
+    observation_noise: Annotated[tuple[NotNegative, ...], Leaf("-")]
+    sampling_time: Annotated[Positive, Leaf("time")]
+    horizon: Annotated[Count, Leaf("samples")]
+    input_low: Annotated[Vector, Leaf(DEVIATION)]
+    input_high: Annotated[Vector, Leaf(DEVIATION)]
+    balance: BalanceParams | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        n_states = len(self.controlled)
+        n_inputs = len(self.manipulated)
+        _same_length(n_states, self, "controlled_description", "drift_state", "drift_input")
+        _same_length(n_states, self, "disturbance", "observation_noise")
+        _same_length(n_inputs, self, "manipulated_description", "input_low", "input_high")
+        for name, width in (("drift_state", n_states), ("drift_input", n_inputs)):
+            if any(len(row) != width for row in getattr(self, name)):
+                raise PydanticCustomError(
+                    "length", "'{name}' has a row whose length is not {width}", {"name": name, "width": width}
+                )
+        if any(low >= high for low, high in zip(self.input_low, self.input_high, strict=True)):
+            raise PydanticCustomError("bounds", "'input_low' must lie below 'input_high' for every input")
+        return self
+
+
+class GainParams(Record):
+    """Gains of a PID controller, one a control loop."""
+
+    proportional: Annotated[Vector, Leaf("input/output")]
+    integral: Annotated[Vector, Leaf("input/(output time)")]
+    derivative: Annotated[Vector, Leaf("input time/output")]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        _same_length(len(self.proportional), self, "integral", "derivative")
+        return self
+
+
+class FeatureParams(Record):
+    """params/features.yaml: Section 4.2."""
+
+    beta: Annotated[Positive, Leaf("-")]
+    discount: Annotated[Positive, Field(le=1), Leaf("-")]
+    features_on: Annotated[Literal["x", "y"], Leaf("-")]
+    initial_error: Annotated[NotNegative, Leaf("-")]
+
+
+class PolicyParams(Record):
+    """The network and the distribution of the policy, Section 3.2."""
+
+    hidden_cells: Annotated[tuple[Count, ...], Field(min_length=1), Leaf("cells")]
+    leaky_slope: Annotated[NotNegative, Leaf("-")]
+    error_unit: Annotated[tuple[Positive, ...], Leaf(DEVIATION)]
+    initial_output_scale: Annotated[Positive, Leaf("1/sqrt(cells)")]
+    std_low: Annotated[Positive, Leaf("input range")]
+    std_high: Annotated[Positive, Leaf("input range")]
+    initial_std: Annotated[Positive, Leaf("input range")]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if not self.std_low <= self.initial_std <= self.std_high or self.std_low == self.std_high:
+            raise PydanticCustomError("std", "expected std_low <= initial_std <= std_high and std_low < std_high")
+        return self
+
+
+class ScaleParams(Record):
+    """How much is computed: the smoke run or the paper's."""
+
+    number_type: Annotated[Literal["float32", "float64"], Leaf("-")]
+    threads: Annotated[Count, Leaf("threads")]
+    demonstrations: Annotated[Count, Field(gt=1), Leaf("trajectories")]
+    episodes: Annotated[Count, Field(gt=1), Leaf("episodes")]
+    measured: Annotated[Count, Field(gt=1), Leaf("episodes")]
+    evaluation: Annotated[Count, Field(gt=1), Leaf("trajectories")]
+    expert_evaluation: Annotated[Count, Field(gt=1), Leaf("trajectories")]
+    epoch_share: Annotated[Share, Leaf("-")]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.episodes + self.measured > EPISODES_PER_EPOCH:
+            raise PydanticCustomError("epoch", "'episodes' and 'measured' exceed {top} an epoch", {"top": EPISODES_PER_EPOCH})
+        return self
+
+
+class LearnerParams(Record):
+    """Algorithm 1."""
+
+    credit: Annotated[Literal["whole_return", "reward_to_go"], Leaf("-")]
+    credit_decay: Annotated[Share, Leaf("-")]
+    minibatches: Annotated[Count, Leaf("per epoch")]
+    ratio_clip: Annotated[Positive, Leaf("-")]
+    learning_rate_start: Annotated[Positive, Leaf("-")]
+    learning_rate_end: Annotated[Positive, Leaf("-")]
+    averaging: Annotated[Memory, Leaf("-")]
+    patience: Annotated[int, Strict(), Field(ge=0), Leaf("epochs")]
+
+
+class WeightParams(Record):
+    """The ascent of Algorithm 2 in the reward weights."""
+
+    iterations: Annotated[Literal["case", "epochs"], Leaf("-")]
+    initial: Annotated[Vector, Leaf("-")]
+    step: Annotated[Positive, Leaf("-")]
+    decay: Annotated[Memory, Leaf("-")]
+    bound: Annotated[Positive, Leaf("-")]
+    scaled_by_expert: Annotated[bool, Strict(), Leaf("-")]
+    averaging: Annotated[Memory, Leaf("-")]
+    keep_nearest: Annotated[bool, Strict(), Leaf("-")]
+    selection_memory: Annotated[Memory, Leaf("-")]
+
+
+class VariantParams(Record):
+    """One variant of Algorithms 1 and 2."""
+
+    learner: LearnerParams
+    weights: WeightParams
+
+
+class OnlineLearningParams(Record):
+    """Algorithm 1 under the real objective."""
+
+    episodes: Annotated[Count, Field(gt=1, le=EPISODES_PER_EPOCH), Leaf("episodes")]
+    learner: LearnerParams
+
+
+class LearningParams(Record):
+    """params/learning.yaml: what the paper's supporting information would have held."""
+
+    policy: PolicyParams
+    scales: dict[Text, ScaleParams]
+    variants: dict[Text, VariantParams]
+    online: OnlineLearningParams
+
+
+class OfflineParams(Record):
+    """The offline half of a case study."""
+
+    epochs: Annotated[Count, Leaf("epochs")]
+    iterations: Annotated[Count, Leaf("iterations")]
+    transfer_from: Annotated[Count, Leaf("case")] | None = None
+
+
+class OnlineParams(Record):
+    """The online half of a case study: rounds of epochs, each with its own beta."""
+
+    epochs: Annotated[tuple[Count, ...], Field(min_length=1), Leaf("epochs")]
+    beta: Annotated[tuple[Positive, ...], Field(min_length=1), Leaf("-")]
+    headline_beta: Annotated[Positive, Leaf("-")]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        _same_length(len(self.epochs), self, "beta")
+        return self
+
+
+class CaseParams(Record):
+    """params/case_<n>.yaml: Table 1 and the settings of one case study."""
+
+    title: Annotated[Text, Leaf("-")]
+    demonstrator: Annotated[Text, Leaf("-")]
+    set_point: Annotated[Vector, Leaf(DEVIATION)]
+    steady_state: Annotated[Vector, Leaf(DEVIATION)]
+    error_scale: Annotated[tuple[NotZero, ...], Leaf(DEVIATION)] | None = None
+    initial_mean: Annotated[Vector, Leaf(DEVIATION)]
+    initial_std: Annotated[tuple[NotNegative, ...], Leaf(DEVIATION)]
+    offline: OfflineParams
+    online: OnlineParams
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        _same_length(len(self.set_point), self, "steady_state")
+        if self.error_scale is not None:
+            _same_length(len(self.set_point), self, "error_scale")
+        elif any(target == rest for target, rest in zip(self.set_point, self.steady_state, strict=True)):
+            raise PydanticCustomError(
+                "scale", "'set_point' equals 'steady_state' in a loop, so the error has no scale: give 'error_scale'"
+            )
+        return self
+
+    @property
+    def scale_of_error(self) -> tuple[float, ...]:
+        """The denominator of Eq. 4.2.1: y_sp - y_ss, unless the file gives another."""
+        if self.error_scale is not None:
+            return self.error_scale
+        return tuple(target - rest for target, rest in zip(self.set_point, self.steady_state, strict=True))
+
+
+class PublishedCase(Record):
+    """One table of results as the paper prints it."""
+
+    table: Count
+    expert: Vector
+    policy: Vector
+    alpha: Vector
+
+
+@dataclass(frozen=True)
+class Params:
+    """Everything that one stage of one case needs to know, and `leaves`: a row for the report for every leaf read."""
+
+    process: ProcessParams
+    demonstrator: GainParams
+    features: FeatureParams
+    learning: LearningParams
+    case: CaseParams
+    leaves: tuple[dict[str, Any], ...]
+
+
+def load(root: Path, case: int) -> Params:
+    """The parameters of a case from a folder of parameter files.
+
+    Raises:
+        ParameterError: if a file is missing, damaged or holds a value that cannot be, in one sentence.
+    """
+    case_file = root / f"case_{case}.yaml"
+    if not case_file.is_file():
+        known = ", ".join(sorted(path.stem.removeprefix("case_") for path in root.glob("case_*.yaml"))) or "none"
+        raise ParameterError(f"{case_file}: there is no case {case}; the cases are {known}")
+    names = ("process.yaml", "demonstrators.yaml", "features.yaml", "learning.yaml", case_file.name)
+    raw = {name: read_yaml(root / name) for name in names}
+    process = validate(ProcessParams, raw["process.yaml"], root / "process.yaml")
+    demonstrators = {
+        name: validate(GainParams, entry, root / "demonstrators.yaml", name) for name, entry in raw["demonstrators.yaml"].items()
+    }
+    record = validate(CaseParams, raw[case_file.name], case_file)
+    if record.demonstrator not in demonstrators:
+        known = ", ".join(demonstrators)
+        raise ParameterError(f"{case_file}: key 'demonstrator': expected one of {known}, found '{record.demonstrator}'")
+    n_controlled, n_manipulated = len(process.controlled), len(process.manipulated)
+    gains = demonstrators[record.demonstrator]
+    learning = validate(LearningParams, raw["learning.yaml"], root / "learning.yaml")
+    lengths = (
+        (case_file, "set_point", record.set_point, n_controlled),
+        (case_file, "initial_mean", record.initial_mean, n_controlled),
+        (case_file, "initial_std", record.initial_std, n_controlled),
+        (root / "demonstrators.yaml", f"{record.demonstrator}.proportional", gains.proportional, n_controlled),
+        (root / "learning.yaml", "policy.error_unit", learning.policy.error_unit, n_controlled),
+    )
+    for path, key, value, expected in lengths:
+        if len(value) != expected:
+            raise ParameterError(f"{path}: key '{key}': expected {expected} entries, one a variable, found {len(value)}")
+    if n_manipulated != n_controlled:
+        path = root / "process.yaml"
+        raise ParameterError(f"{path}: key 'manipulated': a PID pairs {n_controlled} loops, found {n_manipulated} inputs")
+    leaves = tuple(row for name in names for row in list_leaves(raw[name], name))
+    return Params(
+        process=process,
+        demonstrator=gains,
+        features=validate(FeatureParams, raw["features.yaml"], root / "features.yaml"),
+        learning=learning,
+        case=record,
+        leaves=leaves,
+    )
+
+
+def load_published(root: Path, case: int) -> PublishedCase:
+    """The paper's table for a case."""
+    path = root / "published.yaml"
+    raw = read_yaml(path)
+    if f"case_{case}" not in raw:
+        raise ParameterError(f"{path}: the key 'case_{case}' is missing")
+    return validate(PublishedCase, raw[f"case_{case}"], path, f"case_{case}")
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A parameter file as nested dictionaries; YAML 1.2, so that 1e-3 is a number."""
+    if not path.is_file():
+        raise ParameterError(f"{path}: the parameter file is missing")
+    try:
+        content = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+    except DuplicateKeyError as error:
+        raise ParameterError(f"{path}: {' '.join(str(error.problem).split())}") from error
+    except (MarkedYAMLError, UnicodeDecodeError, ValueError) as error:
+        raise ParameterError(f"{path}: not readable as YAML: {' '.join(str(error).split())[:200]}") from error
+    if not isinstance(content, dict):
+        raise ParameterError(f"{path}: expected keys and values, found {type(content).__name__}")
+    return content
+
+
+def validate(kind: type[R], content: Any, path: Path, prefix: str = "") -> R:
+    """The content of a file as a record, or one sentence that names the file and the first key that is wrong."""
+    try:
+        return kind.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join([prefix, *(str(part) for part in first["loc"])]).strip(".")
+        message = {"missing": "the key is missing", "extra_forbidden": "the key is unknown"}.get(first["type"])
+        if message is None:
+            found = first["input"]
+            shown = "" if isinstance(found, (dict, BaseModel)) else f", found {found!r}"
+            message = first["msg"][:1].lower() + first["msg"][1:] + shown
+        raise ParameterError(f"{path}: key '{key}': {message}") from error
+
+
+def list_leaves(content: Any, file: str, key: str = "") -> list[dict[str, Any]]:
+    """Every leaf below `content` as {file, key, value, unit, source, status}."""
+    if isinstance(content, dict) and set(content) == set(LEAF_KEYS):
+        return [{"file": file, "key": key, **content}]
+    if isinstance(content, dict):
+        return [row for name, entry in content.items() for row in list_leaves(entry, file, f"{key}.{name}".strip("."))]
+    return []

@@ -1,0 +1,161 @@
+"""The LSTM policy of Section 3.2: its distribution over the inputs, and its fast stepping in closed loop."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from helpers.params import PolicyParams
+from helpers.task import ControlTask
+
+RELU6_TOP = 6.0  # Eq. 3.2.5
+
+
+class LSTMPolicy(nn.Module):
+    """u_t ~ N(mu_t, diag(sigma_t^2)): an LSTM maps the history of normalised errors and inputs to mu and sigma.
+
+    Each hidden layer is an LSTM with its usual gates whose output passes a leaky ReLU on its way up (the recurrence
+    sees it without). The output layer ends in ReLU6 (Eq. 3.2.5), whose range 0 to 6 is mapped onto the input bounds for
+    the mean, and onto the range of permitted standard deviations. What the network sees at time t is the error of each
+    loop, y_sp - y, in units of `error_unit`, and the previous input, scaled so that the bounds are -1 and 1. The unit of
+    the error is the same in all cases: a policy carried over to another set point keeps its gain, as a PID does.
+    """
+
+    def __init__(self, params: PolicyParams, n_controlled: int, n_manipulated: int) -> None:
+        super().__init__()
+        self.params = params
+        self.n_manipulated = n_manipulated
+        widths = [n_controlled + n_manipulated, *params.hidden_cells]
+        self.layers = nn.ModuleList(nn.LSTM(below, width) for below, width in zip(widths, params.hidden_cells, strict=False))
+        self.output = nn.Linear(widths[-1], n_manipulated + n_manipulated)
+        self.error_unit = nn.Buffer(torch.tensor(params.error_unit), persistent=False)
+
+    @property
+    def lstms(self) -> list[nn.LSTM]:
+        """The hidden layers, from the input upwards."""
+        return [layer for layer in self.layers if isinstance(layer, nn.LSTM)]
+
+    @classmethod
+    def initial(cls, params: PolicyParams, task: ControlTask, generator: torch.Generator) -> "LSTMPolicy":
+        """A fresh policy whose mean input is near u* = 0 and whose standard deviation is the initial one."""
+        policy = cls(params, len(task.set_point), len(task.input_low)).to(task.set_point.dtype)
+        with torch.no_grad():
+            for layer in policy.lstms:
+                bound = 1 / math.sqrt(layer.hidden_size)
+                for parameter in layer.parameters():
+                    parameter.copy_(torch.rand(parameter.shape, generator=generator, dtype=parameter.dtype) * 2 * bound - bound)
+            weight = policy.output.weight
+            bound = params.initial_output_scale / math.sqrt(weight.shape[1])
+            weight.copy_(torch.rand(weight.shape, generator=generator, dtype=weight.dtype) * 2 * bound - bound)
+            policy.output.bias[: policy.n_manipulated] = -RELU6_TOP * task.input_low / (task.input_high - task.input_low)
+        policy.reset_exploration()
+        return policy
+
+    def reset_exploration(self) -> None:
+        """Set the standard deviation to its initial value everywhere, so that a policy carried over can explore again."""
+        params, rows = self.params, slice(self.n_manipulated, None)
+        with torch.no_grad():
+            self.output.weight[rows] = 0
+            self.output.bias[rows] = RELU6_TOP * (params.initial_std - params.std_low) / (params.std_high - params.std_low)
+
+    def network_inputs(self, y: Tensor, u_previous: Tensor, task: ControlTask) -> Tensor:
+        """What the network sees, shape (..., n_y + n_u), from observations and the inputs applied one sample before."""
+        error = (task.set_point - y) / self.error_unit
+        middle, half = (task.input_high + task.input_low) / 2, (task.input_high - task.input_low) / 2
+        return torch.cat([error, (u_previous - middle) / half], dim=-1)
+
+    def scale(self, output: Tensor, task: ControlTask) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the inputs, each (..., n_u), from the output layer before its activation."""
+        fraction = functional.relu6(output) / RELU6_TOP
+        mean, deviation = fraction.split(self.n_manipulated, dim=-1)
+        span = task.input_high - task.input_low
+        std = (self.params.std_low + (self.params.std_high - self.params.std_low) * deviation) * span
+        return task.input_low + span * mean, std
+
+    def forward(self, y: Tensor, u: Tensor, task: ControlTask) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of u_0..u_{T-1} along recorded trajectories, each (T, K, n_u).
+
+        Args:
+            y: observations y_0..y_{T-1} (a y_T is ignored), shape (T or T + 1, K, n_y).
+            u: applied inputs u_0..u_{T-1}, shape (T, K, n_u). Before the first sample the input is u* = 0.
+        """
+        previous = torch.cat([torch.zeros_like(u[:1]), u[:-1]])
+        signal = self.network_inputs(y[: len(u)], previous, task)
+        for layer in self.lstms:
+            signal = functional.leaky_relu(layer(signal)[0], self.params.leaky_slope)
+        return self.scale(self.output(signal), task)
+
+    def log_probability(self, y: Tensor, u: Tensor, command: Tensor, task: ControlTask) -> Tensor:
+        """ln pi(command_t | y_0..y_t, u_0..u_{t-1}), shape (T, K): the term of Eq. 3.2.3.
+
+        The probability is that of the command before it was clipped to the bounds, which is what the policy drew.
+        """
+        mean, std = self(y, u, task)
+        return (-(((command - mean) / std) ** 2) / 2 - std.log() - math.log(2 * math.pi) / 2).sum(-1)
+
+
+@dataclass
+class PolicyMemory:
+    """Hidden and cell state of every layer, features first, and the exploration noise of every step."""
+
+    step: int
+    signals: list[Tensor]  # [input, hidden] of each layer, (width_below + width, K)
+    cells: list[Tensor]  # (width, K)
+    u_previous: Tensor  # (K, n_u)
+    exploration: Tensor | None  # (T, K, n_u), standard normal
+
+
+class PolicyController:
+    """A policy in closed loop: the same mathematics as `LSTMPolicy.forward`, one step at a time, without gradients.
+
+    Each layer and step is one product with the stacked [input, hidden] buffer, features first so that each gate is a
+    contiguous block. `exploring` draws from the distribution; without it the mode is used, as on deployment.
+    """
+
+    def __init__(self, policy: LSTMPolicy, task: ControlTask, exploring: bool) -> None:
+        self.policy = policy
+        self.task = task
+        self.exploring = exploring
+        self.weights, self.biases = [], []
+        for layer in policy.lstms:
+            from_below, from_before, bias_below, bias_before = (parameter.detach() for parameter in layer.all_weights[0])
+            self.weights.append(torch.cat([from_below, from_before], dim=1))
+            self.biases.append((bias_below + bias_before)[:, None])
+        self.output_weight = policy.output.weight.detach()
+        self.output_bias = policy.output.bias.detach()[:, None]
+
+    def start(self, n_trajectories: int, n_steps: int, generator: torch.Generator) -> PolicyMemory:
+        """Zero hidden states, the input at u* = 0, and all exploration noise drawn at once."""
+        like = self.output_weight
+        n_inputs = self.policy.n_manipulated
+        return PolicyMemory(
+            step=0,
+            signals=[like.new_zeros(weight.shape[1], n_trajectories) for weight in self.weights],
+            cells=[like.new_zeros(weight.shape[0] // 4, n_trajectories) for weight in self.weights],
+            u_previous=like.new_zeros(n_trajectories, n_inputs),
+            exploration=torch.randn(n_steps, n_trajectories, n_inputs, generator=generator, dtype=like.dtype)
+            if self.exploring
+            else None,
+        )
+
+    def act(self, observation: Tensor, memory: PolicyMemory) -> tuple[Tensor, PolicyMemory]:
+        """The policy's command for one sample; the memory is updated in place."""
+        signal = self.policy.network_inputs(observation, memory.u_previous, self.task).T
+        for buffer, cell, weight, bias in zip(memory.signals, memory.cells, self.weights, self.biases, strict=True):
+            width = len(cell)
+            buffer[:-width] = signal
+            gates = torch.addmm(bias, weight, buffer)
+            entry, forget, candidate, exit_ = gates.split(width)
+            torch.sigmoid_(gates[: 2 * width])
+            candidate.tanh_()
+            exit_.sigmoid_()
+            cell.mul_(forget).addcmul_(entry, candidate)
+            torch.mul(cell.tanh(), exit_, out=buffer[-width:])
+            signal = functional.leaky_relu(buffer[-width:], self.policy.params.leaky_slope)
+        mean, std = self.policy.scale(torch.addmm(self.output_bias, self.output_weight, signal).T, self.task)
+        command = mean if memory.exploration is None else mean + std * memory.exploration[memory.step]
+        memory.u_previous = command.clamp(self.task.input_low, self.task.input_high)
+        memory.step += 1
+        return command, memory

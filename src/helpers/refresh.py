@@ -1,0 +1,40 @@
+"""Run the notebooks at their defaults and store the outputs in them: `python -m helpers.refresh`.
+
+The committed notebooks are the smoke run on the small inputs in notebooks/inputs. Those are made first, by the smoke run.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from helpers.run import NOTEBOOKS, execute
+from helpers.session import PROJECT
+
+INPUTS = NOTEBOOKS / "inputs"
+
+
+def make_inputs() -> None:
+    """Run all stages at smoke scale into a fresh folder and put what they wrote into notebooks/inputs."""
+    with tempfile.TemporaryDirectory() as folder:
+        config = ["seeds=1", "scale=smoke", f"results={folder}/results", f"reports={folder}/report"]
+        snakemake = [sys.executable, "-m", "snakemake", "--profile", "profiles/local", "--cores", str(os.cpu_count()), "--nolock"]
+        subprocess.run([*snakemake, "--config", *config], cwd=PROJECT, check=True)
+        shutil.rmtree(INPUTS, ignore_errors=True)
+        shutil.copytree(Path(folder) / "results", INPUTS, ignore=shutil.ignore_patterns("notebooks"))
+
+
+def main() -> int:
+    """Refresh inputs and notebooks; returns the exit status."""
+    os.environ["TQDM_DISABLE"] = "1"
+    make_inputs()
+    for path in sorted(NOTEBOOKS.glob("[0-9]*.ipynb")):
+        execute(path.stem, path, {})
+        print(f"refreshed: {path.relative_to(PROJECT)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,256 @@
+"""Algorithm 1: REINFORCE with baseline for the LSTM policy."""
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from helpers.features import FeatureMap, accumulated_error, discounts, normalised_error
+from helpers.params import LearnerParams
+from helpers.policy import LSTMPolicy, PolicyController
+from helpers.process import Process
+from helpers.rollout import rollout
+from helpers.trajectories import Trajectories
+
+Reward = Callable[[Trajectories], Tensor]  # rewards R_1..R_T, shape (T, K)
+
+
+class TrainingError(RuntimeError):
+    """Learning cannot go on; the message names the epoch and the cause."""
+
+
+def discounted_return(rewards: Tensor, gamma: float) -> Tensor:
+    """G of each trajectory, Eq. 3.1.5: sum_t gamma^(t-1) R_t; (T, K) to (K,)."""
+    return discounts(len(rewards), gamma, rewards) @ rewards
+
+
+def reward_to_go(rewards: Tensor, gamma: float, decay: float = 1.0) -> Tensor:
+    """The part of G that u_t can still change, row t = 0..T-1: the sum of gamma^(s-1) decay^(s-1-t) R_s over s > t.
+
+    With decay = 1 it is exact. Below one it counts late rewards less: they hardly depend on u_t but carry all the noise
+    met on the way, so a little bias buys much variance (Schulman et al. 2016, Eq. 16 with a value of zero).
+    """
+    discounted = rewards * discounts(len(rewards), gamma, rewards)[:, None]
+    future = torch.empty_like(discounted)
+    carried = torch.zeros_like(discounted[0])
+    for t in reversed(range(len(rewards))):
+        carried = discounted[t] + decay * carried
+        future[t] = carried
+    return future
+
+
+def whole_return_advantage(rewards: Tensor, gamma: float) -> Tensor:
+    """G^k - b with one scalar baseline, step 2 of Algorithm 1, the same at every step; (T, K) to (T, K)."""
+    value = discounted_return(rewards, gamma)
+    return (value - value.mean()).expand_as(rewards)
+
+
+def regression_advantage(rewards: Tensor, gamma: float, decay: float, regressors: Tensor) -> Tensor:
+    """Reward-to-go less a baseline of its own for each step: a linear regression on what was known before the input.
+
+    A baseline may depend on the past but not on the present input, so the gradient keeps its expectation (notebook 02).
+
+    Args:
+        rewards: R_1..R_T, shape (T, K).
+        regressors: shape (T, K, p); row t was known before u_t was drawn. A constant is added here.
+    """
+    future = reward_to_go(rewards, gamma, decay)
+    design = torch.cat([torch.ones_like(regressors[..., :1]), regressors], dim=-1)
+    ridge = 1e-3 * rewards.shape[1] * torch.eye(design.shape[-1], dtype=design.dtype)
+    coefficients = torch.linalg.solve(design.mT @ design + ridge, design.mT @ future[..., None])
+    return future - (design @ coefficients)[..., 0]
+
+
+def baseline_regressors(trajectories: Trajectories, features: FeatureMap) -> Tensor:
+    """What the per-step baseline may look at: error, its size and square, its integral, the previous input; (T, K, p).
+
+    All come from the observations, so that the same baseline serves on a plant.
+    """
+    task = features.task
+    error = normalised_error(trajectories.y[:-1], task.set_point, task.error_scale)
+    integral = accumulated_error(error, features.sampling_time)
+    previous = torch.cat([torch.zeros_like(trajectories.u[:1]), trajectories.u[:-1]]) / (task.input_high - task.input_low)
+    return torch.cat([error, error.abs(), error**2, integral, previous], dim=-1)
+
+
+def surrogate(log_probability: Tensor, advantage: Tensor) -> Tensor:
+    """The scalar whose gradient is the policy gradient, Eq. 3.2.4: (1/K) sum_k sum_t A_t^k ln pi(u_t^k | ...)."""
+    return (advantage * log_probability).sum(0).mean()
+
+
+def clipped_surrogate(log_probability: Tensor, drawn: Tensor, advantage: Tensor, clip: float) -> Tensor:
+    """The same gradient for a batch drawn a few steps ago: probability ratios, clipped (Schulman et al. 2017, Eq. 7).
+
+    The paper names proximal policy optimisation as an alternative. Where the policy has not moved since the batch was
+    drawn, the gradient is that of `surrogate`.
+
+    Args:
+        log_probability, drawn: ln pi of the commands under the present policy and under the one that drew them, (T, K).
+    """
+    ratio = (log_probability - drawn).exp()
+    return torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage).sum(0).mean()
+
+
+def annealed(start: float, end: float, progress: float) -> float:
+    """A step size that falls from `start` to `end` along half a cosine while `progress` goes from 0 to 1."""
+    return end + (start - end) * (1 + math.cos(math.pi * progress)) / 2
+
+
+@dataclass(frozen=True)
+class EpochRecord:
+    """What one epoch of Algorithm 1 gave, and what learning had cost by its end.
+
+    `mean_return` is that of the exploring policy and `standard_error` its Monte Carlo error; `policy_std` is the mean
+    standard deviation of the policy as a share of the input range.
+    """
+
+    epochs: int
+    episodes: int
+    gradient_steps: int
+    mean_return: float
+    standard_error: float
+    learning_rate: float
+    policy_std: float
+
+
+class Learner:
+    """A policy under Algorithm 1: its optimiser, the running average of its weights and what learning has cost so far.
+
+    Attributes:
+        policy: the policy that explores and takes the gradient steps.
+        average: the exponential average of its weights, which is what is evaluated and kept. With an averaging
+            coefficient of zero it equals the policy.
+        epochs, episodes, gradient_steps: counted up as they are spent.
+    """
+
+    def __init__(
+        self,
+        policy: LSTMPolicy,
+        process: Process,
+        features: FeatureMap,
+        params: LearnerParams,
+        n_episodes: int,
+        total_epochs: int,
+        generator: torch.Generator,
+    ) -> None:
+        self.policy = policy
+        self.average = copy.deepcopy(policy)
+        self.process = process
+        self.features = features
+        self.params = params
+        self.n_episodes = n_episodes
+        self.total_epochs = total_epochs
+        self.generator = generator
+        self.optimiser = torch.optim.Adam(policy.parameters(), lr=params.learning_rate_start)
+        self.epochs = self.episodes = self.gradient_steps = 0
+
+    def epoch(self, reward: Reward) -> EpochRecord:
+        """One epoch: roll out, weigh, step. Raises TrainingError if the return or the gradient is not finite."""
+        params, gamma, task = self.params, self.features.params.discount, self.features.task
+        rate = annealed(params.learning_rate_start, params.learning_rate_end, self.epochs / max(1, self.total_epochs - 1))
+        controller = PolicyController(self.policy, task, exploring=True)
+        batch = rollout(self.process, controller, task, self.n_episodes, self.generator)
+        rewards = reward(batch)
+        returns = discounted_return(rewards, gamma)
+        if params.credit == "whole_return":
+            advantage = whole_return_advantage(rewards, gamma)
+        else:
+            advantage = regression_advantage(rewards, gamma, params.credit_decay, baseline_regressors(batch, self.features))
+        if not torch.isfinite(advantage).all():
+            raise TrainingError(f"epoch {self.epochs + 1}: the return of the policy is not finite")
+        advantage = advantage / advantage.std()
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        std = self._ascend(batch, advantage)
+        self.epochs += 1
+        self.episodes += self.n_episodes
+        self._update_average()
+        return EpochRecord(
+            self.epochs,
+            self.episodes,
+            self.gradient_steps,
+            returns.mean().item(),
+            returns.std().item() / self.n_episodes**0.5,
+            rate,
+            std,
+        )
+
+    def _ascend(self, batch: Trajectories, advantage: Tensor) -> float:
+        """Gradient steps on one batch, minibatch by minibatch; returns the mean standard deviation of the policy.
+
+        With one minibatch this is the plain policy gradient; with more, every step after the first meets a batch that an
+        older policy drew, and the clipped ratio corrects for it.
+        """
+        task, params = self.features.task, self.params
+        drawn = None
+        if params.minibatches > 1:
+            with torch.no_grad():
+                drawn = self.policy.log_probability(batch.y, batch.u, batch.command, task)
+        for part in range(params.minibatches):
+            rows = slice(part, None, params.minibatches)
+            log_probability = self.policy.log_probability(batch.y[:, rows], batch.u[:, rows], batch.command[:, rows], task)
+            if drawn is None:
+                gain = surrogate(log_probability, advantage)
+            else:
+                gain = clipped_surrogate(log_probability, drawn[:, rows], advantage[:, rows], params.ratio_clip)
+            self.optimiser.zero_grad()
+            (-gain).backward()
+            rate = self.optimiser.param_groups[0]["lr"]
+            for name, parameter in self.policy.named_parameters():
+                if parameter.grad is not None and not parameter.grad.isfinite().all():
+                    raise TrainingError(
+                        f"epoch {self.epochs + 1}: the gradient of {name} is not finite at the learning rate {rate:g}"
+                    )
+            self.optimiser.step()
+            self.gradient_steps += 1
+        with torch.no_grad():
+            std = self.policy(batch.y[:, :1], batch.u[:, :1], task)[1]
+            return (std / (task.input_high - task.input_low)).mean().item()
+
+    def _update_average(self) -> None:
+        # The warm-up keeps the untrained first weights from lingering in the average.
+        keep = min(self.params.averaging, self.epochs / (self.epochs + 9)) if self.params.averaging else 0.0
+        with torch.no_grad():
+            for average, current in zip(self.average.parameters(), self.policy.parameters(), strict=True):
+                average.lerp_(current, 1 - keep)
+
+
+def reinforce(
+    learner: Learner,
+    reward: Reward,
+    n_epochs: int,
+    patience: int = 0,
+    report: Callable[[EpochRecord], None] = lambda record: None,
+) -> list[EpochRecord]:
+    """Algorithm 1: at most `n_epochs` epochs under one reward; `report` is called with the record of each.
+
+    Early stopping: with `patience` > 0, stops once that many epochs in a row brought no better mean return.
+    """
+    records: list[EpochRecord] = []
+    best = 0
+    for _ in range(n_epochs):
+        records.append(learner.epoch(reward))
+        report(records[-1])
+        if records[-1].mean_return >= records[best].mean_return:
+            best = len(records) - 1
+        if patience and len(records) - 1 - best >= patience:
+            break
+    return records
+
+
+def improve_online(
+    learner: Learner,
+    epochs: Sequence[int],
+    betas: Sequence[float],
+    report: Callable[[EpochRecord], None] = lambda record: None,
+) -> list[EpochRecord]:
+    """Online learning, Section 5.1.2: rounds of Algorithm 1 under the tracking objective, each with its own beta."""
+    records: list[EpochRecord] = []
+    for n_epochs, beta in zip(epochs, betas, strict=True):
+        tracking = partial(learner.features.tracking, beta=beta)
+        records += reinforce(learner, tracking, n_epochs, learner.params.patience, report)
+    return records

@@ -1,0 +1,104 @@
+"""One stage = one notebook, executed by papermill. `python -m helpers.run --help` tells how."""
+
+import argparse
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import papermill
+from nbclient.exceptions import DeadKernelError
+from papermill.exceptions import PapermillExecutionError
+from traitlets.config import Config
+
+from helpers.params import ParameterError
+from helpers.session import PROJECT, SessionError, check_parameters
+
+NOTEBOOKS = PROJECT / "notebooks"
+
+
+def execute(notebook: str, output: Path, parameters: dict[str, Any]) -> None:
+    """Run a notebook with papermill; the executed copy, whole or failed, ends up at `output`.
+
+    Raises:
+        ParameterError, SessionError: if the parameters cannot be used; nothing was run then.
+        PapermillExecutionError: if a cell failed; its traceback stands in the executed copy.
+    """
+    source = NOTEBOOKS / f"{notebook}.ipynb"
+    if not source.is_file():
+        known = ", ".join(sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb")))
+        raise SessionError(f"{source}: there is no such notebook; the notebooks are {known}")
+    check_parameters(notebook, parameters)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    # Kernels started side by side race for TCP ports; where the platform has Unix sockets, a fresh folder for each
+    # kernel's sockets avoids the race. Its path must stay short: socket names are limited to about 100 characters.
+    with tempfile.TemporaryDirectory(prefix="hk") as sockets:
+        config = Config()
+        if os.name == "posix":
+            config.KernelManager.transport = "ipc"
+            config.KernelManager.ip = str(Path(sockets) / "k")
+        partial = output.with_name(f".{output.stem}.{os.getpid()}.ipynb")
+        try:
+            papermill.execute_notebook(
+                source,
+                partial,
+                parameters=parameters,
+                kernel_name="python3",
+                cwd=str(NOTEBOOKS),
+                progress_bar=False,
+                log_output=False,
+                config=config,
+            )
+        finally:
+            if partial.exists():
+                strip_machine(partial)
+                partial.replace(output)
+
+
+def strip_machine(path: Path) -> None:
+    """Take papermill's paths and times out of an executed notebook, so that it can be compared and published."""
+    notebook = nbformat.read(path, as_version=4)
+    notebook.metadata.pop("papermill", None)
+    for cell in notebook.cells:
+        cell.metadata.pop("papermill", None)
+        cell.metadata.pop("execution", None)
+        tags = [tag for tag in cell.metadata.get("tags", []) if tag != "papermill-error-cell-tag"]
+        if tags:
+            cell.metadata["tags"] = tags
+        else:
+            cell.metadata.pop("tags", None)
+    nbformat.write(notebook, path)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m helpers.run", description="Run one notebook of the reproduction by papermill.")
+    parser.add_argument("notebook", help="its name without ending, such as 02_offline_irl")
+    parser.add_argument("output", type=Path, help="where the executed copy goes")
+    parser.add_argument(
+        "-p", "--parameter", nargs=2, action="append", default=[], metavar=("NAME", "VALUE"), help="a parameter of the notebook"
+    )
+    given = parser.parse_args(arguments)
+    os.environ["TQDM_DISABLE"] = "1"
+    parameters = {name: int(value) if value.lstrip("-").isdigit() else value for name, value in given.parameter}
+    what = " ".join([given.notebook, *(f"{name}={value}" for name, value in parameters.items() if not name.endswith("_root"))])
+    try:
+        execute(given.notebook, given.output, parameters)
+    except (ParameterError, SessionError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except PapermillExecutionError as error:
+        print(f"error: {what}: {error.ename}: {error.evalue} (executed copy with the traceback: {given.output})", file=sys.stderr)
+        return 1
+    except DeadKernelError:
+        print(f"error: {what}: the kernel died (executed copy up to there: {given.output})", file=sys.stderr)
+        return 1
+    print(f"done: {what}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,268 @@
+"""What a notebook knows of its run: its parameters, checked, and the objects that they describe."""
+
+import hashlib
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch
+from IPython.display import Markdown
+
+from helpers import artifacts
+from helpers.controllers import PID
+from helpers.features import FeatureMap, feature_names
+from helpers.params import Params, PublishedCase, ScaleParams, VariantParams, load, load_published
+from helpers.policy import LSTMPolicy
+from helpers.process import LinearProcess
+from helpers.randomness import stream
+from helpers.task import ControlTask
+
+PROJECT = Path(__file__).resolve().parents[2]
+NOTEBOOK_PARAMETERS = {
+    "case": int,
+    "seed": int,
+    "seeds": int,
+    "scale": str,
+    "variant": str,
+    "input_root": str,
+    "output_root": str,
+    "params_root": str,
+}
+PLAIN = (str, int, float, list, dict, type(None))
+IPYTHON_NAMES = ("In", "Out")
+
+
+class SessionError(ValueError):
+    """A notebook was given a parameter it does not have, or a value it cannot use."""
+
+    def _render_traceback_(self) -> list[str]:
+        """What IPython shows: the sentence alone."""
+        return [f"{type(self).__name__}: {self}"]
+
+
+@dataclass(frozen=True)
+class Session:
+    """One run of one notebook."""
+
+    notebook: str
+    case: int
+    seed: int
+    scale: str
+    variant: str
+    input_root: Path
+    output_root: Path
+    params_root: Path
+    params: Params
+    scale_params: ScaleParams
+    variant_params: VariantParams
+    started: float = field(default_factory=time.perf_counter)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The number type of this scale."""
+        return getattr(torch, self.scale_params.number_type)
+
+    @property
+    def published(self) -> PublishedCase:
+        """The paper's table for this case."""
+        return load_published(self.params_root, self.case)
+
+    @cached_property
+    def process(self) -> LinearProcess:
+        """The process of Eq. 4.1.3-4.1.4."""
+        return LinearProcess(self.params.process, self.dtype)
+
+    @cached_property
+    def task(self) -> ControlTask:
+        """The control task of this case, Table 1."""
+        return ControlTask.from_params(self.params.process, self.params.case, self.dtype)
+
+    @cached_property
+    def features(self) -> FeatureMap:
+        """The features of this case."""
+        return FeatureMap(self.params.features, self.task, self.params.process.sampling_time)
+
+    @cached_property
+    def expert(self) -> PID:
+        """The demonstrating controller of this case."""
+        return PID(self.params.demonstrator, self.task.set_point, self.params.process.sampling_time)
+
+    @property
+    def feature_names(self) -> list[str]:
+        """Names of the features in their order."""
+        return feature_names(self.params.process.controlled)
+
+    def epochs(self, full: int) -> int:
+        """How many of the paper's epochs this scale runs."""
+        return max(1, round(full * self.scale_params.epoch_share))
+
+    def stream(self, *purpose: str) -> torch.Generator:
+        """The random stream of this seed and case for one purpose."""
+        return stream(self.seed, self.case, *purpose)
+
+    def folder(self, root: Path, stage: str, case: int | None = None) -> Path:
+        """Where a stage of this scale and seed keeps its results below a root."""
+        return root / self.scale / f"seed_{self.seed}" / f"case_{case or self.case}" / stage
+
+    def load(self, stage: str, made_by: str, case: int | None = None) -> artifacts.Stage:
+        """A finished earlier stage; `made_by` is the notebook to run where it is missing."""
+        return artifacts.load_stage(self.folder(self.input_root, stage, case), f"{made_by} for case {case or self.case}")
+
+    def save(self, stage: str, tables: Mapping[str, pd.DataFrame], policy: LSTMPolicy | None = None) -> artifacts.Stage:
+        """Write a stage's results with a record of where they come from."""
+        record = {
+            "notebook": self.notebook,
+            "case": self.case,
+            "seed": self.seed,
+            "scale": self.scale,
+            "variant": self.variant,
+            "parameters": parameters_hash(self.params),
+            "seconds": time.perf_counter() - self.started,
+            "revision": artifacts.code_revision(PROJECT),
+            "versions": artifacts.versions(),
+        }
+        return artifacts.save_stage(self.folder(self.output_root, stage), record, tables, policy)
+
+    def banner(self) -> Markdown:
+        """What kind of run this is, for the top of the notebook."""
+        run = f"{self.params.case.title}, seed {self.seed}"
+        if self.scale != "smoke":
+            return Markdown(f"**{run}, scale `{self.scale}`.**")
+        copy = f"reports/reference/notebooks/{self.notebook}_case_{self.case}.ipynb"
+        return Markdown(
+            f"**{run}. This is the smoke run: a few seconds, few epochs, results without meaning.** "
+            f"The full run's executed copy is [{copy}](../{copy})."
+        )
+
+    def settings(self) -> pd.DataFrame:
+        """What the notebook was run with."""
+        scale = {f"scale.{key}": value for key, value in self.scale_params.model_dump().items()}
+        given = {"case": self.case, "seed": self.seed, "scale": self.scale, "variant": self.variant}
+        return pd.DataFrame([{"setting": key, "value": str(value)} for key, value in (given | scale).items()])
+
+
+def parameters_hash(params: Params) -> str:
+    """A hash of every parameter that a case was run with."""
+    content = json.dumps([[leaf["file"], leaf["key"], leaf["value"]] for leaf in params.leaves], sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class ReportSession:
+    """One run of the report's notebook, which reads all cases and `seeds` seeds."""
+
+    cases: tuple[int, ...]
+    seeds: int
+    scale: str
+    input_root: Path
+    output_root: Path
+    params_root: Path
+
+    def banner(self) -> Markdown:
+        """What kind of run this is, for the top of the notebook."""
+        if self.scale != "smoke":
+            return Markdown(f"**{self.seeds} seed(s), scale `{self.scale}`.**")
+        report = "reports/reference/report.html"
+        return Markdown(
+            "**This is the smoke run on the small committed results of notebooks 01 to 04: its numbers mean nothing.** "
+            f"The full run's report is [{report}](../{report})."
+        )
+
+
+def check_parameters(notebook: str, given: Mapping[str, Any]) -> Params:
+    """The parameter files' records for what a notebook was given; what is not given has the notebook's default.
+
+    Raises:
+        SessionError, ParameterError: in one sentence, if a name is unknown or a value cannot be used.
+    """
+    where = f"notebooks/{notebook}.ipynb"
+    for name in given:
+        if name not in NOTEBOOK_PARAMETERS:
+            raise SessionError(f"{where}: there is no parameter '{name}'; the parameters are {', '.join(NOTEBOOK_PARAMETERS)}")
+    for name, kind in NOTEBOOK_PARAMETERS.items():
+        if name in given and type(given[name]) is not kind:
+            words = "a whole number" if kind is int else "a text"
+            raise SessionError(f"{where}: parameter '{name}': expected {words}, found {given[name]!r}")
+    for name, least in (("seed", 0), ("seeds", 1)):
+        if given.get(name, least) < least:
+            raise SessionError(f"{where}: parameter '{name}': expected {least} or more, found {given[name]}")
+    params = load(Path(given.get("params_root") or PROJECT / "params").resolve(), given.get("case", 1))
+    for name, known in (("scale", params.learning.scales), ("variant", params.learning.variants)):
+        if name in given and given[name] not in known:
+            raise SessionError(f"{where}: parameter '{name}': expected one of {', '.join(known)}, found '{given[name]}'")
+    return params
+
+
+def _given(notebook: str, namespace: dict[str, Any]) -> tuple[dict[str, Any], Params]:
+    """What a notebook was given, checked; names that are no parameters count only when the notebook first asks."""
+    first_time = "_session_opened" not in namespace  # a cell that is run again meets the notebook's own variables
+    given = {
+        name: value
+        for name, value in namespace.items()
+        if name in NOTEBOOK_PARAMETERS
+        or (first_time and not name.startswith("_") and name not in IPYTHON_NAMES and isinstance(value, PLAIN))
+    }
+    params = check_parameters(notebook, given)
+    namespace["_session_opened"] = True
+    # Whole tables in the plain text of an output too, which is what nbval compares.
+    pd.set_option("display.max_columns", None, "display.width", 200, "display.max_rows", 400, "display.max_colwidth", 120)
+    pd.set_option("display.float_format", "{:.6g}".format)
+    return given, params
+
+
+def _root(given: Mapping[str, Any], name: str, default: str) -> Path:
+    return Path(given.get(name) or PROJECT / default).resolve()
+
+
+def _inputs(scale: str) -> str:
+    return "notebooks/inputs" if scale == "smoke" else "results"
+
+
+def open_session(notebook: str, namespace: dict[str, Any]) -> Session:
+    """Check what the notebook was given, and set the scale up.
+
+    Args:
+        notebook: its name without ending.
+        namespace: its `globals()`, taken before anything else was defined, so that a misspelt parameter is found:
+            papermill itself only logs a warning and runs on with the defaults.
+
+    Raises:
+        SessionError, ParameterError: in one sentence.
+    """
+    given, params = _given(notebook, namespace)
+    scale, variant = given["scale"], given.get("variant", "improved")
+    scale_params = params.learning.scales[scale]
+    torch.set_num_threads(scale_params.threads)
+    return Session(
+        notebook=notebook,
+        case=given.get("case", 1),
+        seed=given["seed"],
+        scale=scale,
+        variant=variant,
+        input_root=_root(given, "input_root", _inputs(scale)),
+        output_root=_root(given, "output_root", "results"),
+        params_root=_root(given, "params_root", "params"),
+        params=params,
+        scale_params=scale_params,
+        variant_params=params.learning.variants[variant],
+    )
+
+
+def open_report(notebook: str, namespace: dict[str, Any]) -> ReportSession:
+    """`open_session` for the report's notebook, which has no case of its own: the cases are those of the parameter files."""
+    given, _ = _given(notebook, namespace)
+    params_root = _root(given, "params_root", "params")
+    cases = sorted(int(path.stem.removeprefix("case_")) for path in params_root.glob("case_*.yaml"))
+    return ReportSession(
+        cases=tuple(cases),
+        seeds=given["seeds"],
+        scale=given["scale"],
+        input_root=_root(given, "input_root", _inputs(given["scale"])),
+        output_root=_root(given, "output_root", "results/smoke/report" if given["scale"] == "smoke" else "reports/latest"),
+        params_root=params_root,
+    )

@@ -1,0 +1,170 @@
+"""The verbs of the notebooks: record, imitate, improve and judge, each for the case and scale of a session."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import pandas as pd
+import torch
+from torch import Tensor
+
+from helpers.artifacts import trajectories_from_table
+from helpers.controllers import Controller
+from helpers.evaluation import feature_gap, relative_gap, scores
+from helpers.features import FeatureMap
+from helpers.maxent_irl import Apprenticeship, IterationRecord, initial_weights, maxent_irl
+from helpers.policy import LSTMPolicy, PolicyController
+from helpers.progress import ProgressBar
+from helpers.reinforce import EpochRecord, Learner, improve_online
+from helpers.rollout import rollout
+from helpers.session import Session
+from helpers.trajectories import Trajectories
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """The recorded trajectories of the expert, and the expert's own figures of merit on many fresh ones."""
+
+    trajectories: Trajectories
+    scores: pd.Series
+
+    def features(self, features: FeatureMap) -> Tensor:
+        """v_E as the learner knows it: the mean over the recorded trajectories, shape (d,)."""
+        return features.trajectory(self.trajectories).mean(0)
+
+    def true_features(self, names: list[str]) -> Tensor:
+        """v_E of the demonstrating controller on many fresh trajectories, to judge by, shape (d,)."""
+        return torch.tensor([self.scores[f"v:{name}"] for name in names])
+
+
+def load_demonstrations(session: Session) -> Demonstrations:
+    """What notebook 01 recorded for the session's case."""
+    stage = session.load("demonstrations", "01_demonstrations")
+    process = session.params.process
+    trajectories = trajectories_from_table(
+        stage.table("demonstrations.csv"), process.controlled, process.manipulated, session.dtype, stage.path("demonstrations.csv")
+    )
+    rows = stage.table("scores.csv", ("stage", "metric", "value"))
+    return Demonstrations(trajectories, rows.set_index("metric")["value"])
+
+
+def fresh_policy(session: Session) -> LSTMPolicy:
+    """An untrained policy."""
+    return LSTMPolicy.initial(session.params.learning.policy, session.task, session.stream("policy"))
+
+
+def load_policy(session: Session, stage: str, made_by: str, case: int | None = None) -> tuple[LSTMPolicy, Tensor]:
+    """The policy and the weights alpha* of an earlier offline stage, maybe of another case."""
+    found = session.load(stage, made_by, case)
+    weights = found.table("weights.csv", ("feature", "alpha"))
+    alpha = torch.tensor(weights["alpha"].to_numpy(), dtype=session.dtype)
+    return found.policy(session.params.learning, session.task), alpha
+
+
+def imitate(session: Session, demonstrations: Demonstrations, policy: LSTMPolicy, start: Tensor | None = None) -> Apprenticeship:
+    """Offline learning: Algorithm 2 from a policy and weights; without `start` the weights begin at their signs.
+
+    A policy that was trained before gets its initial exploration back.
+    """
+    variant, scale, offline = session.variant_params, session.scale_params, session.params.case.offline
+    n_epochs = session.epochs(offline.epochs)
+    n_iterations = n_epochs if variant.weights.iterations == "epochs" else min(offline.iterations, n_epochs)
+    if start is None:
+        start = initial_weights(variant.weights, len(session.task.set_point), session.dtype)
+    policy.reset_exploration()
+    generator = session.stream("offline", session.variant)
+    learner = Learner(policy, session.process, session.features, variant.learner, scale.episodes, n_epochs, generator)
+    return maxent_irl(
+        learner,
+        demonstrations.features(session.features),
+        start,
+        variant.weights,
+        n_iterations,
+        scale.measured,
+        ProgressBar(n_epochs, "offline"),
+    )
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """The result of online learning."""
+
+    policy: LSTMPolicy
+    records: tuple[EpochRecord, ...]
+
+
+def improve(session: Session, policy: LSTMPolicy, features_on: str) -> Improvement:
+    """Online learning: the case's rounds of Algorithm 1 under the tracking objective, read from x or from y."""
+    online, learning = session.params.case.online, session.params.learning.online
+    epochs = [session.epochs(n_epochs) for n_epochs in online.epochs]
+    generator = session.stream("online", session.variant, features_on)
+    scale = session.scale_params
+    n_episodes = min(learning.episodes, scale.episodes + scale.measured)
+    policy.reset_exploration()
+    learner = Learner(
+        policy, session.process, session.features.on(features_on), learning.learner, n_episodes, sum(epochs), generator
+    )
+    records = improve_online(learner, epochs, online.beta, ProgressBar(sum(epochs), f"online on {features_on}"))
+    return Improvement(learner.average, tuple(records))
+
+
+def deploy(session: Session, policy: LSTMPolicy) -> PolicyController:
+    """The policy as it would run on the plant: its mode."""
+    return PolicyController(policy, session.task, exploring=False)
+
+
+def fresh_trajectories(session: Session, controller: Controller, n_trajectories: int | None = None) -> Trajectories:
+    """Trajectories that no learning has seen; the same disturbances for every controller."""
+    number = n_trajectories or session.scale_params.evaluation
+    return rollout(session.process, controller, session.task, number, session.stream("evaluation"))
+
+
+def judge(session: Session, trajectories: Trajectories) -> dict[str, float]:
+    """All figures of merit of a controller from its trajectories, at the headline beta."""
+    process = session.params.process
+    return scores(trajectories, session.features, session.params.case.online.headline_beta, process.controlled, process.manipulated)
+
+
+def judge_imitation(
+    session: Session, trajectories: Trajectories, demonstrations: Demonstrations, result: Apprenticeship
+) -> dict[str, float]:
+    """`judge`, the feature gap to the true expert, the weights, and what learning cost."""
+    mean = session.features.trajectory(trajectories).mean(0).double()
+    names = session.feature_names
+    truth = demonstrations.true_features(names).double()
+    last = result.records[-1]
+    rows = judge(session, trajectories) | {"feature_gap": feature_gap(mean, truth)}
+    rows |= {f"gap:{name}": value for name, value in zip(names, relative_gap(mean, truth).tolist(), strict=True)}
+    rows |= {f"alpha:{name}": value for name, value in zip(names, result.weights.tolist(), strict=True)}
+    return rows | {"chosen_epoch": float(result.chosen_epoch)} | cost(last)
+
+
+def judge_improvement(session: Session, trajectories: Trajectories, result: Improvement) -> dict[str, float]:
+    """`judge` and what learning cost."""
+    return judge(session, trajectories) | cost(result.records[-1])
+
+
+def cost(record: EpochRecord | IterationRecord) -> dict[str, float]:
+    """What learning had cost by the end of a record."""
+    return {name: float(getattr(record, name)) for name in ("epochs", "episodes", "gradient_steps")}
+
+
+def score_table(by_stage: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
+    """Figures of merit as a long table: stage, metric, value."""
+    rows = [(stage, metric, value) for stage, figures in by_stage.items() for metric, value in figures.items()]
+    return pd.DataFrame(rows, columns=["stage", "metric", "value"])
+
+
+def history_table(records: tuple[EpochRecord, ...] | tuple[IterationRecord, ...], feature_names: list[str]) -> pd.DataFrame:
+    """Records of learning as a table; the weights become one column a feature, `alpha:<feature>`."""
+    rows: list[dict[str, Any]] = []
+    for record in records:
+        row = asdict(record)
+        weights = row.pop("weights", ())
+        rows.append(row | {f"alpha:{name}": value for name, value in zip(feature_names, weights, strict=False)})
+    return pd.DataFrame(rows)
+
+
+def weight_table(feature_names: list[str], weights: Tensor) -> pd.DataFrame:
+    """alpha* as a table: feature, alpha."""
+    return pd.DataFrame({"feature": feature_names, "alpha": weights.tolist()})

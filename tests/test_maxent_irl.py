@@ -209,19 +209,19 @@ def test_the_result_is_reproducible_bit_for_bit(study, weights_of):
 
 
 def test_the_nearest_epoch_is_kept_where_asked(study, weights_of):
-    case = study()
+    case, n_epochs = study(), 6
 
     def run(keep):
-        learner, expert, start = setting(case, total_epochs=8, learning_rate_start=0.05, learning_rate_end=0.05)
-        return learner, maxent_irl(learner, expert, start, weights_of(keep_nearest=keep), 8, 5)
+        learner, expert, start = setting(case, total_epochs=n_epochs, learning_rate_start=0.05, learning_rate_end=0.05)
+        return learner, maxent_irl(learner, expert, start, weights_of(keep_nearest=keep), n_epochs, 5)
 
     learner, last = run(False)
     gaps = [record.feature_gap for record in last.records]
-    assert last.chosen_epoch == 8
+    assert last.chosen_epoch == n_epochs
     assert all(torch.equal(a, b) for a, b in zip(last.policy.parameters(), learner.policy.parameters(), strict=True))
     _, nearest = run(True)
     assert [record.feature_gap for record in nearest.records] == gaps
-    assert nearest.chosen_epoch == 1 + int(np.argmin(gaps)) < 8  # an earlier epoch, so that the choice shows
+    assert nearest.chosen_epoch == 1 + int(np.argmin(gaps)) < n_epochs  # an earlier epoch, so that the choice shows
 
 
 def test_learning_goes_on_without_touching_the_kept_policy(study, weights_of):

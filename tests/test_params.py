@@ -38,7 +38,9 @@ def refusal(folder, case=1):
     with pytest.raises(ParameterError) as caught:
         load(folder, case)
     sentence = str(caught.value)
-    assert "\n" not in sentence and "key ''" not in sentence and len(sentence) < 500 + len(str(folder)), sentence
+    assert "\n" not in sentence, sentence
+    assert "key ''" not in sentence, sentence
+    assert len(sentence) < 500 + len(str(folder)), sentence
     return sentence
 
 
@@ -218,7 +220,9 @@ def test_a_wrong_value_is_named(folder, file, key, value, says):
     edit(folder / file, {key: value})
     sentence = refusal(folder)
     last = key.removesuffix(".value").split(".")[-1]
-    assert file in sentence and last in sentence and says in sentence, sentence
+    assert file in sentence, sentence
+    assert last in sentence, sentence
+    assert says in sentence, sentence
 
 
 def test_three_vectors_of_another_length_are_refused(folder):
@@ -282,7 +286,9 @@ LEAVES = [
 def test_a_wrong_leaf_is_named(folder, changes, says):
     edit(folder / "process.yaml", {f"sampling_time.{key}": value for key, value in changes.items()})
     sentence = refusal(folder)
-    assert "process.yaml" in sentence and "'sampling_time'" in sentence and says in sentence, sentence
+    assert "process.yaml" in sentence, sentence
+    assert "'sampling_time'" in sentence, sentence
+    assert says in sentence, sentence
 
 
 @pytest.mark.parametrize("entry", [0.04, None, [0.04], "0.04"], ids=str)

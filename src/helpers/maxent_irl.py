@@ -34,13 +34,15 @@ def initial_weights(params: WeightParams, n_loops: int, dtype: torch.dtype) -> T
 class WeightAscent:
     """Gradient ascent on the log-likelihood of the demonstrations, Eq. 3.4.6, clipped and then of unit norm.
 
-    lambda <- clip((1 - decay) lambda + kappa D grad), alpha = lambda / |lambda|. With decay = 0 and D = I this is the
-    printed step. A decay is a Gaussian prior on the weights (their log-density adds -decay/(2 kappa) |lambda|^2): old
-    evidence fades, which damps the swinging of alpha about a policy that already matches. D = diag(1/|v_E|) measures
-    each feature in units of the expert's own value.
+    lambda <- clip((1 - decay) lambda + kappa D grad), alpha = lambda / |lambda|. With D = I and without decay this is the
+    printed step, which goes on from alpha itself. A decay is a Gaussian prior on the weights (it adds
+    -decay/(2 kappa) |lambda|^2 to the log-likelihood): old evidence fades, which damps the swinging of alpha about a
+    policy that already matches. D = diag(1/|v_E|) measures each feature in units of the expert's own value.
     """
 
     def __init__(self, params: WeightParams, start: Tensor, expert_features: Tensor) -> None:
+        if params.scaled_by_expert and not expert_features.all():
+            raise TrainingError("a feature of the expert is zero, so its gap has no scale: set scaled_by_expert to false")
         self.params = params
         self.raw = start.clone()
         self.weights = project(start)
@@ -50,7 +52,8 @@ class WeightAscent:
     def step(self, gradient: Tensor) -> None:
         """One step along the gradient, shape (d,)."""
         params = self.params
-        raw = (1 - params.decay) * self.raw + params.step * self.metric * gradient
+        before = self.raw if params.decay else self.weights
+        raw = (1 - params.decay) * before + params.step * self.metric * gradient
         self.raw = raw.clamp(-params.bound, params.bound)
         self.weights = project(self.raw)
         self.mean = params.averaging * self.mean + (1 - params.averaging) * self.weights
@@ -106,7 +109,8 @@ def maxent_irl(
     """Algorithm 2: policy optimisation, Monte Carlo evaluation, gradient, ascent; `n_iterations` times.
 
     The epochs of the learner are shared evenly among the iterations. With as many iterations as epochs, the weights
-    move a little after every epoch.
+    move a little after every epoch. What is measured is the mode of the present policy, because a running average would
+    lag behind and make the weights swing; what is kept is the learner's average where the smoothed gap is least.
 
     Args:
         expert_features: v_E, the mean trajectory features of the demonstrations, shape (d,).

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchema
 from pydantic_core import PydanticCustomError, core_schema
 from ruamel.yaml import YAML
 from ruamel.yaml.constructor import DuplicateKeyError
-from ruamel.yaml.error import MarkedYAMLError
+from ruamel.yaml.error import YAMLError
 
 LEAF_KEYS = ("value", "unit", "source", "status")
 STATUSES = ("reported", "inferred", "assumed")
@@ -94,6 +94,14 @@ def _same_length(expected: int, record: BaseModel, *names: str) -> None:
                 {"name": name, "found": len(getattr(record, name)), "expected": expected},
             )
 
+
+KEY_MESSAGES = {
+    "missing": "the key is missing",
+    "extra_forbidden": "the key is unknown",
+    "tuple_type": "expected a list in brackets",
+    "dict_type": "expected keys and values",
+    "model_type": "expected keys and values",
+}
 
 R = TypeVar("R", bound=Record)
 
@@ -208,8 +216,8 @@ class LearnerParams(Record):
     credit_decay: Annotated[Share, Leaf("-")]
     minibatches: Annotated[Count, Leaf("per epoch")]
     ratio_clip: Annotated[Positive, Leaf("-")]
-    learning_rate_start: Annotated[Positive, Leaf("-")]
-    learning_rate_end: Annotated[Positive, Leaf("-")]
+    learning_rate_start: Annotated[Share, Leaf("-")]
+    learning_rate_end: Annotated[Share, Leaf("-")]
     averaging: Annotated[Memory, Leaf("-")]
     patience: Annotated[int, Strict(), Field(ge=0), Leaf("epochs")]
 
@@ -218,7 +226,7 @@ class WeightParams(Record):
     """The ascent of Algorithm 2 in the reward weights."""
 
     iterations: Annotated[Literal["case", "epochs"], Leaf("-")]
-    initial: Annotated[Vector, Leaf("-")]
+    initial: Annotated[Vector, Field(min_length=3, max_length=3), Leaf("-")]
     step: Annotated[Positive, Leaf("-")]
     decay: Annotated[Memory, Leaf("-")]
     bound: Annotated[Positive, Leaf("-")]
@@ -226,6 +234,12 @@ class WeightParams(Record):
     averaging: Annotated[Memory, Leaf("-")]
     keep_nearest: Annotated[bool, Strict(), Leaf("-")]
     selection_memory: Annotated[Memory, Leaf("-")]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if not any(self.initial):
+            raise PydanticCustomError("weights", "'initial' holds zeros only, which have no direction")
+        return self
 
 
 class VariantParams(Record):
@@ -250,6 +264,14 @@ class LearningParams(Record):
     variants: dict[Text, VariantParams]
     online: OnlineLearningParams
 
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        fewest = min(scale.episodes for scale in self.scales.values())
+        for learner in (self.online.learner, *(variant.learner for variant in self.variants.values())):
+            if learner.minibatches > fewest:
+                raise PydanticCustomError("batch", "'minibatches' exceeds the {fewest} episodes of a scale", {"fewest": fewest})
+        return self
+
 
 class OfflineParams(Record):
     """The offline half of a case study."""
@@ -257,6 +279,12 @@ class OfflineParams(Record):
     epochs: Annotated[Count, Leaf("epochs")]
     iterations: Annotated[Count, Leaf("iterations")]
     transfer_from: Annotated[Count, Leaf("case")] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.iterations > self.epochs:
+            raise PydanticCustomError("iterations", "'iterations' exceeds 'epochs'")
+        return self
 
 
 class OnlineParams(Record):
@@ -287,7 +315,8 @@ class CaseParams(Record):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        _same_length(len(self.set_point), self, "steady_state")
+        if len(self.steady_state) != len(self.set_point):
+            raise PydanticCustomError("length", "'set_point' and 'steady_state' differ in length")
         if self.error_scale is not None:
             _same_length(len(self.set_point), self, "error_scale")
         elif any(target == rest for target, rest in zip(self.set_point, self.steady_state, strict=True)):
@@ -311,6 +340,11 @@ class PublishedCase(Record):
     expert: Vector
     policy: Vector
     alpha: Vector
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        _same_length(len(self.expert), self, "policy", "alpha")
+        return self
 
 
 @dataclass(frozen=True)
@@ -389,10 +423,13 @@ def read_yaml(path: Path) -> dict[str, Any]:
         content = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
     except DuplicateKeyError as error:
         raise ParameterError(f"{path}: {' '.join(str(error.problem).split())}") from error
-    except (MarkedYAMLError, UnicodeDecodeError, ValueError) as error:
+    except (YAMLError, UnicodeDecodeError, ValueError) as error:
         raise ParameterError(f"{path}: not readable as YAML: {' '.join(str(error).split())[:200]}") from error
     if not isinstance(content, dict):
         raise ParameterError(f"{path}: expected keys and values, found {type(content).__name__}")
+    for key in content:
+        if not isinstance(key, str):
+            raise ParameterError(f"{path}: key '{key}': expected a word")
     return content
 
 
@@ -403,12 +440,13 @@ def validate(kind: type[R], content: Any, path: Path, prefix: str = "") -> R:
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join([prefix, *(str(part) for part in first["loc"])]).strip(".")
-        message = {"missing": "the key is missing", "extra_forbidden": "the key is unknown"}.get(first["type"])
+        message = KEY_MESSAGES.get(first["type"])
         if message is None:
             found = first["input"]
             shown = "" if isinstance(found, (dict, BaseModel)) else f", found {found!r}"
             message = first["msg"][:1].lower() + first["msg"][1:] + shown
-        raise ParameterError(f"{path}: key '{key}': {message}") from error
+        where = f"key '{key}': " if key else ""  # a rule between keys names them itself
+        raise ParameterError(f"{path}: {where}{message}") from error
 
 
 def list_leaves(content: Any, file: str, key: str = "") -> list[dict[str, Any]]:

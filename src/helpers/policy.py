@@ -30,7 +30,7 @@ class LSTMPolicy(nn.Module):
         widths = [n_controlled + n_manipulated, *params.hidden_cells]
         self.layers = nn.ModuleList(nn.LSTM(below, width) for below, width in zip(widths, params.hidden_cells, strict=False))
         self.output = nn.Linear(widths[-1], n_manipulated + n_manipulated)
-        self.error_unit = nn.Buffer(torch.tensor(params.error_unit), persistent=False)
+        self.error_unit = nn.Buffer(torch.tensor(params.error_unit, dtype=torch.float64), persistent=False)
 
     @property
     def lstms(self) -> list[nn.LSTM]:

@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from helpers.artifacts import code_revision
 from helpers.session import PROJECT
 
@@ -44,6 +46,45 @@ def check(latest: dict[str, Any], reference: dict[str, Any] | None, revision: st
         raise PublishError(f"the run has {len(latest['seeds'])} seeds, the published one {len(reference['seeds'])}")
 
 
+def glance(comparison: pd.DataFrame) -> str:
+    """README's comparison at a glance, as Markdown, from comparison.csv: one row a case study."""
+    rows = []
+    for case, numbers in comparison.groupby("case"):
+        by_row = {row: group.set_index("feature") for row, group in numbers.groupby("row")}
+        expert, policy = by_row["expert"], by_row["policy"]
+        error = (expert["reproduced"] / expert["published"] - 1).abs().mean()
+        gaps = {source: (policy[source] / expert[source] - 1).abs().mean() for source in ("published", "reproduced")}
+        rows.append(
+            {
+                "case study": "I" * int(case),
+                "expert error": f"{100 * error:.1f} %",
+                "feature gap, paper": f"{100 * gaps['published']:.1f} %",
+                "feature gap, ours": f"{100 * gaps['reproduced']:.1f} %",
+            }
+        )
+    n_seeds = int(comparison["n_seeds"].min())
+    seeds = "one seed" if n_seeds == 1 else f"medians over {n_seeds} seeds"
+    return f"{pd.DataFrame(rows).to_markdown(index=False)}\n\n(ours: {seeds})"
+
+
+def time_by_stage(time: pd.DataFrame) -> str:
+    """README's seconds by stage and case, as Markdown, from tables/time.csv."""
+    wide = time.pivot_table(index="stage", columns="case", values="seconds")
+    wide.columns = [f"case {case}, s" for case in wide.columns]
+    cells = wide.map(lambda seconds: "–" if pd.isna(seconds) else f"{seconds:.0f}").reset_index()
+    return f"Seconds inside each stage's notebook, one seed, two stages at a time:\n\n{cells.to_markdown(index=False)}"
+
+
+def fill(text: str, block: str, content: str) -> str:
+    """The text with `content` between the marks of a block."""
+    head, found, rest = text.partition(f"<!-- {block}:")
+    mark, closed, old_and_tail = rest.partition("-->\n")
+    _, ended, tail = old_and_tail.partition(f"<!-- /{block} -->")
+    if not (found and closed and ended):
+        raise PublishError(f"README.md: the marks of the block '{block}' are missing")
+    return f"{head}{found}{mark}{closed}{content}\n{ended}{tail}"
+
+
 def main() -> int:
     """Publish; returns the exit status."""
     try:
@@ -67,6 +108,10 @@ def main() -> int:
     shutil.copy2(LATEST / "notebooks/05_report.ipynb", partial / "notebooks")
     shutil.rmtree(REFERENCE, ignore_errors=True)
     partial.rename(REFERENCE)
+    readme = PROJECT / "README.md"
+    text = fill(readme.read_text(encoding="utf-8"), "glance", glance(pd.read_csv(REFERENCE / "comparison.csv")))
+    text = fill(text, "time", time_by_stage(pd.read_csv(REFERENCE / "tables/time.csv")))
+    readme.write_text(text, encoding="utf-8")
     print(f"published: {REFERENCE}")
     return 0
 

@@ -122,8 +122,8 @@ class Learner:
 
     Attributes:
         policy: the policy that explores and takes the gradient steps.
-        average: the exponential average of its weights, which is what is evaluated and kept. With an averaging
-            coefficient of zero it equals the policy.
+        average: the exponential average of its weights, which is what is kept in the end. With an averaging coefficient
+            of zero it equals the policy.
         epochs, episodes, gradient_steps: counted up as they are spent.
     """
 
@@ -162,7 +162,10 @@ class Learner:
             advantage = regression_advantage(rewards, gamma, params.credit_decay, baseline_regressors(batch, self.features))
         if not torch.isfinite(advantage).all():
             raise TrainingError(f"epoch {self.epochs + 1}: the return of the policy is not finite")
-        advantage = advantage / advantage.std()
+        spread = advantage.std()
+        if not spread > 0:
+            raise TrainingError(f"epoch {self.epochs + 1}: every episode earned the same reward, so there is nothing to learn from")
+        advantage = advantage / spread
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         std = self._ascend(batch, advantage)

@@ -1,5 +1,6 @@
 """The report: collect what the stages wrote, set it beside the paper, draw and typeset. It computes no result."""
 
+import itertools
 import json
 import os
 import shutil
@@ -17,7 +18,7 @@ from matplotlib.figure import Figure
 from helpers import drawings, figures, tables
 from helpers.artifacts import ArtifactError, Stage, code_revision, load_stage, versions
 from helpers.features import feature_names
-from helpers.params import Params, PublishedCase, load, load_published
+from helpers.params import OnlineParams, Params, PublishedCase, load, load_published
 from helpers.session import PROJECT, parameters_hash
 
 TEMPLATE = PROJECT / "reports/template"
@@ -25,6 +26,7 @@ DEMONSTRATIONS, ONLINE = "demonstrations", "online_improved"
 OFFLINE = {"offline": "improved", "offline_printed": "printed"}  # stage in seeds.csv and the variant behind it
 SCRATCH = "offline_improved"  # of a case that starts from another: the same learning without the transfer
 MADE_BY = {"demonstrations": "01", "offline": "02", "online": "03 (04 for the transfer case)", "transfer": "04"}
+LEARNING = {"offline": "improved", "offline_printed": "printed", "offline_scratch": "improved, from scratch"}
 CONTROLLERS = {"expert": "PID", "offline": "offline policy", "online": "online policy", "online_y": "online policy, learned on y"}
 
 
@@ -58,6 +60,11 @@ class Results:
     def table(self, case: int, folder: str, name: str, seed: int = 0) -> pd.DataFrame:
         """One table of one stage."""
         return self.stages[case, seed, folder].table(name)
+
+    def score(self, case: int, folder: str, stage: str, metric: str, seed: int = 0) -> float:
+        """One figure of merit of one stage."""
+        rows = self.table(case, folder, "scores.csv", seed).set_index(["stage", "metric"])
+        return float(rows.loc[(stage, metric), "value"])
 
     def medians(self, stage: str) -> pd.DataFrame:
         """The median over seeds of every metric of a stage: a row for each metric, a column for each case."""
@@ -121,12 +128,33 @@ def draw(results: Results) -> dict[str, Figure]:
         )
         response = results.table(case, offline, "response.csv")
         drawn[f"tracking_case_{case}"] = figures.tracking_figure(response, process.controlled, target, descriptions)
-        drawn[f"learning_curves_case_{case}"] = figures.learning_curves(results.table(case, offline, "history.csv"))
-        drawn[f"online_curves_case_{case}"] = figures.learning_curves(results.table(case, ONLINE, "history.csv"))
+        chosen = int(results.score(case, offline, "offline", "chosen_epoch"))
+        drawn[f"learning_curves_case_{case}"] = figures.learning_curves(
+            results.table(case, offline, "history.csv"),
+            marks={chosen: "policy taken from here"},
+            gap_levels={"the paper's own gap": published_gap(results.published[case])},
+        )
+        history = results.table(case, ONLINE, "history.csv")
+        drawn[f"online_curves_case_{case}"] = figures.learning_curves(history, marks=_rounds(params.case.online, len(history)))
     for number, name in (("3", "control_case_1"), ("4", "tracking_case_2"), ("5", "control_case_2"), ("6", "control_case_3")):
         if name in drawn:
             drawn[f"figure_{number}"] = drawn.pop(name)
     return drawn
+
+
+def published_gap(published: PublishedCase) -> float:
+    """The paper's own feature gap: the mean of |v_pi - v_E| / |v_E| over its two printed rows."""
+    pairs = list(zip(published.policy, published.expert, strict=True))
+    return sum(abs(policy - expert) / abs(expert) for policy, expert in pairs) / len(pairs)
+
+
+def _rounds(online: OnlineParams, n_epochs: int) -> dict[int, str]:
+    """The last epoch before each later round of online learning, and that round's beta, to mark on a curve.
+
+    At smoke scale a run has fewer epochs than the parameters say; its rounds shrink alike.
+    """
+    ends = [round(n_epochs * end / sum(online.epochs)) for end in itertools.accumulate(online.epochs[:-1])]
+    return {end: f"next round, β = {beta:g}" for end, beta in zip(ends, online.beta[1:], strict=True)}
 
 
 def tabulate(results: Results) -> dict[str, pd.DataFrame]:
@@ -145,11 +173,11 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     tabulated["gaps"] = gaps
     tabulated["comparison"] = tables.comparison(results.published, results.seeds, names)
     costs = []
-    for stage in ("offline", "offline_printed", "offline_scratch"):
+    for stage, label in LEARNING.items():
         medians = results.medians(stage)
         for case in medians.columns:
             column = medians[case]
-            costs.append({"case": case, "learning": stage, "feature gap, %": 100 * column["feature_gap"]})
+            costs.append({"case": case, "learning": label, "feature gap, %": 100 * column["feature_gap"]})
             costs[-1] |= {
                 name.replace("_", " "): int(column[name]) for name in ("epochs", "chosen_epoch", "episodes", "gradient_steps")
             }
@@ -161,12 +189,12 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
             row = {
                 "case": case,
                 "controller": label,
-                "objective on x": column["objective_x"],
-                "objective on y": column["objective_y"],
+                "J on x": column["objective_x"],
+                "J on y": column["objective_y"],
             }
-            row |= {f"overshoot {name}, %": 100 * column[f"overshoot:{name}"] for name in process.controlled}
-            row |= {f"offset {name}, %": 100 * column[f"offset:{name}"] for name in process.controlled}
-            row |= {f"movement {name}": column[f"movement:{name}"] for name in process.manipulated}
+            row |= {f"overshoot {tables.symbol(name)}, %": 100 * column[f"overshoot:{name}"] for name in process.controlled}
+            row |= {f"offset {tables.symbol(name)}, %": 100 * column[f"offset:{name}"] for name in process.controlled}
+            row |= {f"movement {tables.symbol(name)}": column[f"movement:{name}"] for name in process.manipulated}
             rows.append(row | {"episodes": column.get("episodes")})
     tabulated["control_quality"] = pd.DataFrame(rows)
     leaves = [leaf for params in results.params.values() for leaf in params.leaves]
@@ -231,9 +259,9 @@ def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapp
     environment = Environment(loader=FileSystemLoader(TEMPLATE), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters["percent"] = lambda share: f"{100 * share:.1f} %"
     environment.filters["table"] = tables.to_markdown
+    environment.filters["rounded_table"] = partial(tables.to_markdown, digits=3)
     environment.filters["results_table"] = partial(tables.to_markdown, decimals=tables.RESULT_DECIMALS)
-    stages = ("expert", "offline", "offline_printed", "offline_scratch", "online", "online_y")
-    medians = {stage: results.medians(stage).to_dict() for stage in stages}
+    medians = {stage: results.medians(stage).to_dict() for stage in results.seeds["stage"].unique()}
     gaps = tabulated["gaps"].set_index("case").to_dict("index")
     return environment.get_template("report.md.jinja").render(
         results=results,

@@ -174,7 +174,7 @@ def to_markdown(
 
 def _header(name: str) -> str:
     typeset = _text(name)
-    if typeset != name or FEATURE.fullmatch(name):
+    if typeset != name or FEATURE.fullmatch(name) or "$" in name:
         return typeset
     words = name.replace("_", " ")
     return words[:1].upper() + words[1:]

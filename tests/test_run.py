@@ -1,0 +1,227 @@
+"""One stage = one notebook: the command line, plain papermill, and the order of the stages in the Snakefile."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import nbformat
+import pytest
+
+from helpers import run
+from helpers.artifacts import load_stage
+from helpers.session import PROJECT
+
+PAPERMILL = [sys.executable, "-m", "papermill", "--no-progress-bar"]
+
+
+def text_of(path):
+    """All the text of an executed notebook, in which its pictures would only match by accident."""
+    return re.sub(r'"image/png": "[^"]*"', "", Path(path).read_text(encoding="utf-8"))
+
+
+def everything_below(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+@pytest.fixture
+def here(monkeypatch, tmp_path):
+    """A working directory that is not the project's, in which `run.main` may not leave its setting behind."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TQDM_DISABLE", "1")
+    return tmp_path
+
+
+@pytest.fixture
+def toy(monkeypatch, here):
+    """Notebooks of one cell, in a folder that stands for the project's."""
+
+    def write(code):
+        cell = nbformat.v4.new_code_cell("case = 1", metadata={"tags": ["parameters"]})
+        (here / "notebooks").mkdir(exist_ok=True)
+        nbformat.write(
+            nbformat.v4.new_notebook(cells=[cell, nbformat.v4.new_code_cell(code)]), here / "notebooks/02_offline_irl.ipynb"
+        )
+        monkeypatch.setattr(run, "NOTEBOOKS", here / "notebooks")
+
+    return write
+
+
+def test_a_notebook_runs_from_any_directory_and_leaves_no_trace_of_the_machine(here, capfd):
+    arguments = ["01_demonstrations", "copies/01.ipynb", "-p", "case", "2", "-p", "seed", "5", "-p", "output_root", str(here / "out")]
+    assert run.main(arguments) == 0
+    assert capfd.readouterr().out.strip() == "done: 01_demonstrations case=2 seed=5"
+    stage = load_stage(here / "out/smoke/seed_5/case_2/demonstrations", "notebook 01")
+    assert {"notebook": "01_demonstrations", "case": 2, "seed": 5, "scale": "smoke"}.items() <= stage.record.items()
+    assert everything_below(here / "copies") == ["01.ipynb"]
+    copy = nbformat.read(here / "copies/01.ipynb", as_version=4)
+    assert "papermill" not in copy.metadata
+    for cell in copy.cells:
+        assert not {"papermill", "execution"} & set(cell.metadata)
+        assert cell.cell_type == "markdown" or cell.execution_count
+    for place in (here, PROJECT, Path.home(), "ipykernel"):
+        assert f"{place}/" not in text_of(here / "copies/01.ipynb")
+
+
+WRONG_ARGUMENTS = {
+    "a misspelt parameter": (["01_demonstrations", "-p", "case", "1", "-p", "sed", "3"], "'sed'"),
+    "an unknown case": (["01_demonstrations", "-p", "case", "9"], "case_9.yaml"),
+    "text for a seed": (["01_demonstrations", "-p", "seed", "--5"], "'seed'"),
+    "an unknown scale": (["02_offline_irl", "-p", "scale", "huge"], "'huge'"),
+    "an unknown notebook": (["06_oracle"], "06_oracle.ipynb"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "says"), WRONG_ARGUMENTS.values(), ids=WRONG_ARGUMENTS)
+def test_wrong_arguments_end_at_once_with_nothing_run_and_nothing_written(monkeypatch, here, capfd, arguments, says):
+    monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, **__: pytest.fail("the notebook was run"))
+    notebook, *parameters = arguments
+    assert run.main([notebook, "copies/x.ipynb", *parameters, "-p", "output_root", str(here / "out")]) == 2
+    said = capfd.readouterr().err
+    assert said.startswith("error: ")
+    assert said.count("\n") == 1
+    assert says in said
+    assert everything_below(here) == []
+
+
+def test_roots_are_those_of_the_callers_directory(monkeypatch, here):
+    """The kernel works elsewhere; a folder may also be named like a number."""
+    handed = {}
+    monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, parameters, **__: handed.update(parameters))
+    shutil.copytree(PROJECT / "params", here / "2024")
+    roots = [["params_root", "2024"], ["output_root", "out"], ["input_root", str(here / "in")]]
+    assert run.main(["01_demonstrations", "x.ipynb", *(word for root in roots for word in ("-p", *root))]) == 0
+    assert handed == {name: str(here / Path(folder).name) for name, folder in roots}
+
+
+def test_a_missing_result_ends_in_a_sentence_and_keeps_the_executed_copy(here, capfd):
+    arguments = ["02_offline_irl", "copies/02.ipynb", "-p", "input_root", str(here / "nothing"), "-p", "output_root", str(here / "out")]
+    assert run.main(arguments) == 1
+    said = capfd.readouterr().err.strip()
+    missing = here / "nothing/smoke/seed_0/case_1/demonstrations/record.json"
+    sentence = f"ArtifactError: {missing}: this result is missing; run 01_demonstrations for case 1 first"
+    assert said.splitlines()[-1] == f"error: 02_offline_irl: {sentence} (executed copy with the traceback: copies/02.ipynb)"
+    assert everything_below(here) == ["copies", "copies/02.ipynb"]
+    outputs = [output for cell in nbformat.read("copies/02.ipynb", 4).cells for output in cell.get("outputs", [])]
+    (error,) = [output for output in outputs if output.output_type == "error"]
+    assert "\n".join(error.traceback) == sentence
+
+
+def test_a_notebook_that_raises_keeps_its_traceback_in_place_of_an_older_copy(here, toy, capfd):
+    toy("good = 1\nbad = good / 0")
+    (here / "02.ipynb").write_text("an older run")
+    assert run.main(["02_offline_irl", "02.ipynb"]) == 1
+    assert "error: 02_offline_irl: ZeroDivisionError: division by zero (executed copy" in capfd.readouterr().err
+    (error,) = [output for cell in nbformat.read("02.ipynb", 4).cells for output in cell.get("outputs", [])]
+    traceback = re.sub(r"\x1b\[[\d;]*m", "", "\n".join(error.traceback))
+    assert "----> 2 bad = good / 0" in traceback
+    assert everything_below(here) == ["02.ipynb", "notebooks", "notebooks/02_offline_irl.ipynb"]
+
+
+def test_a_kernel_that_dies_is_told(here, toy, capfd):
+    toy("import os\nos._exit(1)")
+    assert run.main(["02_offline_irl", "02.ipynb"]) == 1
+    assert "error: 02_offline_irl: the kernel died" in capfd.readouterr().err
+
+
+def test_plain_papermill_refuses_a_misspelt_parameter(here):
+    """papermill itself only warns; the notebook's first cell ends the run."""
+    notebook = PROJECT / "notebooks/01_demonstrations.ipynb"
+    command = [*PAPERMILL, notebook, "01.ipynb", "-p", "case", "1", "-p", "sed", "3", "-p", "output_root", str(here / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "notebooks/01_demonstrations.ipynb: there is no parameter 'sed'; the parameters are case, seed" in done.stderr
+    assert everything_below(here) == ["01.ipynb"]
+
+
+# The order of the stages ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def plan(tmp_path):
+    """A copy of what the Snakefile reads, so that files can be touched; returns the jobs that it would run, by rule."""
+    copy = tmp_path / "copy"
+    for part in ("params", "profiles", "src/helpers", "reports/template"):
+        shutil.copytree(PROJECT / part, copy / part, ignore=shutil.ignore_patterns("__pycache__"))
+    (copy / "notebooks").mkdir()
+    for path in (PROJECT / "Snakefile", *(PROJECT / "notebooks").glob("*.ipynb")):
+        shutil.copy(path, copy / path.relative_to(PROJECT))
+
+    def dry_run(*targets, **config):
+        settings = [f"{name}={value}" for name, value in ({"scale": "smoke", "reports": "report"} | config).items()]
+        snakemake = [sys.executable, "-m", "snakemake", "-n", "--profile", "profiles/local", "--cores", "1", "--nolock"]
+        done = subprocess.run(
+            [*snakemake, "--config", *settings, "--", *targets], cwd=copy, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        counts = dict(re.findall(r"^(\w+) +(\d+)$", (done.stdout + done.stderr), re.MULTILINE))
+        return {rule: int(count) for rule, count in counts.items() if rule not in ("all", "total")}
+
+    dry_run.folder = copy
+    return dry_run
+
+
+@pytest.fixture
+def finished(plan):
+    """The same after a finished run."""
+    shutil.copytree(PROJECT / "notebooks/inputs", plan.folder / "results")
+    (plan.folder / "report").mkdir()
+    # As stages finish one after the other: code and parameters, then their results, then the report.
+    order = {"record.json": 2000, "report.html": 3000, "provenance.json": 3000}
+    for name in ("report.html", "provenance.json"):
+        (plan.folder / "report" / name).touch()
+    stages = ["demonstrations", "offline", "transfer", "online"]
+    for path in plan.folder.rglob("*"):
+        after = next((number for number, stage in enumerate(stages) if path.parent.name.startswith(stage)), 0)
+        time = order.get(path.name, 1000) + after
+        os.utime(path, (time, time))
+    return plan
+
+
+ONE_SEED = {"demonstrations": 3, "offline": 5, "online": 2, "transfer": 2, "report": 1}
+STAGE = "results/smoke/seed_0/case_{}/{}/record.json"
+
+
+def test_the_whole_run_is_fourteen_jobs_with_all_and_each_seed_repeats_its_stages(plan):
+    assert plan() == ONE_SEED
+    assert sum(ONE_SEED.values()) + 1 == 14
+    assert plan(seeds=2) == {rule: count if rule == "report" else 2 * count for rule, count in ONE_SEED.items()}
+
+
+@pytest.mark.parametrize(
+    ("target", "jobs"),
+    [
+        (STAGE.format(2, "demonstrations"), {"demonstrations": 1}),
+        (STAGE.format(2, "online_improved"), {"demonstrations": 1, "offline": 1, "online": 1}),
+        (STAGE.format(3, "online_printed"), {"demonstrations": 2, "offline": 1, "transfer": 1}),
+    ],
+    ids=["recording", "online", "transfer"],
+)
+def test_a_stage_asked_for_alone_runs_only_what_it_needs(plan, target, jobs):
+    assert plan(target) == jobs
+
+
+def test_finished_stages_are_skipped(finished):
+    assert finished() == {}
+    (finished.folder / STAGE.format(2, "online_improved")).unlink()
+    assert finished() == {"online": 1, "report": 1}
+
+
+@pytest.mark.parametrize(
+    ("changed", "jobs"),
+    [
+        ("params/case_2.yaml", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
+        ("params/published.yaml", {"report": 1}),
+        ("notebooks/04_knowledge_transfer.ipynb", {"transfer": 2, "report": 1}),
+        ("src/helpers/maxent_irl.py", ONE_SEED),
+        ("src/helpers/report.py", {"report": 1}),
+        ("reports/template/report.md.jinja", {"report": 1}),
+        # Stages draw with it, and store what they draw (response.csv).
+        ("src/helpers/figures.py", ONE_SEED),
+    ],
+)
+def test_a_change_makes_what_depends_on_it_run_again(finished, changed, jobs):
+    (finished.folder / changed).touch()
+    assert finished() == jobs

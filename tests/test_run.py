@@ -50,7 +50,19 @@ def toy(monkeypatch, here):
 
 
 def test_a_notebook_runs_from_any_directory_and_leaves_no_trace_of_the_machine(here, capfd):
-    arguments = ["01_demonstrations", "copies/01.ipynb", "-p", "case", "2", "-p", "seed", "5", "-p", "output_root", str(here / "out")]
+    arguments = [
+        "01_demonstrations",
+        "copies/01.ipynb",
+        "-p",
+        "case",
+        "2",
+        "-p",
+        "seed",
+        "5",
+        "-p",
+        "output_root",
+        str(here / "out"),
+    ]
     assert run.main(arguments) == 0
     assert capfd.readouterr().out.strip() == "done: 01_demonstrations case=2 seed=5"
     stage = load_stage(here / "out/smoke/seed_5/case_2/demonstrations", "notebook 01")
@@ -68,7 +80,8 @@ def test_a_notebook_runs_from_any_directory_and_leaves_no_trace_of_the_machine(h
 WRONG_ARGUMENTS = {
     "a misspelt parameter": (["01_demonstrations", "-p", "case", "1", "-p", "sed", "3"], "'sed'"),
     "an unknown case": (["01_demonstrations", "-p", "case", "9"], "case_9.yaml"),
-    "text for a seed": (["01_demonstrations", "-p", "seed", "--5"], "'seed'"),
+    "text for a seed": (["01_demonstrations", "-p", "seed", "five"], "'seed'"),
+    "a strange digit": (["01_demonstrations", "-p", "seed", "²"], "'seed'"),
     "an unknown scale": (["02_offline_irl", "-p", "scale", "huge"], "'huge'"),
     "an unknown notebook": (["06_oracle"], "06_oracle.ipynb"),
 }
@@ -97,7 +110,16 @@ def test_roots_are_those_of_the_callers_directory(monkeypatch, here):
 
 
 def test_a_missing_result_ends_in_a_sentence_and_keeps_the_executed_copy(here, capfd):
-    arguments = ["02_offline_irl", "copies/02.ipynb", "-p", "input_root", str(here / "nothing"), "-p", "output_root", str(here / "out")]
+    arguments = [
+        "02_offline_irl",
+        "copies/02.ipynb",
+        "-p",
+        "input_root",
+        str(here / "nothing"),
+        "-p",
+        "output_root",
+        str(here / "out"),
+    ]
     assert run.main(arguments) == 1
     said = capfd.readouterr().err.strip()
     missing = here / "nothing/smoke/seed_0/case_1/demonstrations/record.json"
@@ -205,7 +227,8 @@ def test_a_stage_asked_for_alone_runs_only_what_it_needs(plan, target, jobs):
 
 def test_finished_stages_are_skipped(finished):
     assert finished() == {}
-    (finished.folder / STAGE.format(2, "online_improved")).unlink()
+    for path in (STAGE.format(2, "online_improved"), "report/report.html"):
+        (finished.folder / path).unlink()
     assert finished() == {"online": 1, "report": 1}
 
 

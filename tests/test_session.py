@@ -82,7 +82,8 @@ def test_no_seeds_at_all_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("notebook", "given"), [("01_demonstrations", {"seeds": 3}), ("01_demonstrations", {"variant": "printed"}), (REPORT, {"seed": 1})]
+    ("notebook", "given"),
+    [("01_demonstrations", {"seeds": 3}), ("01_demonstrations", {"variant": "printed"}), (REPORT, {"seed": 1})],
 )
 def test_a_parameter_of_another_notebook_is_refused(notebook, given):
     """`-p seeds 3` for `-p seed 3` would otherwise run seed 0 without a word."""

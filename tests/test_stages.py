@@ -27,7 +27,15 @@ CONTROL |= {"movement:C_A0", "movement:T_E"} | {f"v:{name}" for name in FEATURES
 
 
 def session(case=1, variant="improved", scale="smoke", **given):
-    namespace = {"case": case, "seed": 0, "scale": scale, "variant": variant, "input_root": "", "output_root": "", "params_root": ""}
+    namespace = {
+        "case": case,
+        "seed": 0,
+        "scale": scale,
+        "variant": variant,
+        "input_root": "",
+        "output_root": "",
+        "params_root": "",
+    }
     return open_session("02_offline_irl", namespace | given)
 
 
@@ -52,7 +60,9 @@ def test_demonstrations_are_what_notebook_01_recorded(learned):
     assert demonstrations.trajectories.n_steps == run.params.process.horizon
     assert demonstrations.trajectories.x.dtype == run.dtype
     rows = pd.read_csv(run.folder(run.input_root, "demonstrations") / "scores.csv").set_index("metric")["value"]
-    assert demonstrations.true_features(run.feature_names).tolist() == pytest.approx([rows[f"v:{name}"] for name in run.feature_names])
+    assert demonstrations.true_features(run.feature_names).tolist() == pytest.approx(
+        [rows[f"v:{name}"] for name in run.feature_names]
+    )
     # The few recorded trajectories and the many fresh ones are of one controller.
     known, true = demonstrations.features(run.features), demonstrations.true_features(run.feature_names)
     torch.testing.assert_close(known.double(), true.double(), rtol=0.15, atol=0)
@@ -62,7 +72,9 @@ def test_figures_of_merit_have_the_names_that_the_report_reads(learned):
     run, demonstrations, offline, online, _ = learned
     trajectories = stages.fresh_trajectories(run, stages.deploy(run, offline.policy))
     imitation = stages.judge_imitation(run, trajectories, demonstrations, offline)
-    expected = CONTROL | COST | {"feature_gap", "chosen_epoch"} | {f"{kind}:{name}" for kind in ("gap", "alpha") for name in FEATURES}
+    expected = (
+        CONTROL | COST | {"feature_gap", "chosen_epoch"} | {f"{kind}:{name}" for kind in ("gap", "alpha") for name in FEATURES}
+    )
     assert imitation.keys() == expected
     gaps = [abs(imitation[f"gap:{name}"]) for name in FEATURES]
     assert imitation["feature_gap"] == pytest.approx(sum(gaps) / len(gaps))

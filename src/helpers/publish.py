@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from helpers.artifacts import code_revision
-from helpers.session import PROJECT
+from helpers.request import PROJECT
 
 LATEST, REFERENCE, RESULTS = PROJECT / "reports/latest", PROJECT / "reports/reference", PROJECT / "results"
 PARTS = ("report.html", "figures", "tables", "comparison.csv", "seeds.csv", "provenance.json")

@@ -19,7 +19,8 @@ from helpers import drawings, figures, tables
 from helpers.artifacts import ArtifactError, Stage, code_revision, load_stage, versions
 from helpers.features import feature_names
 from helpers.params import OnlineParams, Params, PublishedCase, load, load_published
-from helpers.session import PROJECT, parameters_hash
+from helpers.request import PROJECT
+from helpers.session import parameters_hash
 
 TEMPLATE = PROJECT / "reports/template"
 DEMONSTRATIONS, ONLINE = "demonstrations", "online_improved"

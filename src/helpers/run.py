@@ -15,7 +15,7 @@ from papermill.exceptions import PapermillExecutionError
 from traitlets.config import Config
 
 from helpers.params import ParameterError
-from helpers.session import PROJECT, SessionError, check_parameters
+from helpers.request import PROJECT, SessionError, check_parameters
 
 NOTEBOOKS = PROJECT / "notebooks"
 

@@ -16,33 +16,15 @@ from IPython.display import Markdown
 from helpers import artifacts
 from helpers.controllers import PID
 from helpers.features import FeatureMap, feature_names
-from helpers.params import Params, PublishedCase, ScaleParams, VariantParams, load, load_published
+from helpers.params import Params, PublishedCase, ScaleParams, VariantParams, load_published
 from helpers.policy import LSTMPolicy
 from helpers.process import LinearProcess
 from helpers.randomness import stream
+from helpers.request import NOTEBOOK_PARAMETERS, PROJECT, check_parameters
 from helpers.task import ControlTask
 
-PROJECT = Path(__file__).resolve().parents[2]
-NOTEBOOK_PARAMETERS = {
-    "case": int,
-    "seed": int,
-    "seeds": int,
-    "scale": str,
-    "variant": str,
-    "input_root": str,
-    "output_root": str,
-    "params_root": str,
-}
 PLAIN = (str, int, float, list, dict, type(None))
 IPYTHON_NAMES = ("In", "Out")
-
-
-class SessionError(ValueError):
-    """A notebook was given a parameter it does not have, or a value it cannot use."""
-
-    def _render_traceback_(self) -> list[str]:
-        """What IPython shows: the sentence alone."""
-        return [f"{type(self).__name__}: {self}"]
 
 
 @dataclass(frozen=True)
@@ -172,30 +154,6 @@ class ReportSession:
             "**This is the smoke run on the small committed results of notebooks 01 to 04: its numbers mean nothing.** "
             f"The full run's report is [{report}](../{report})."
         )
-
-
-def check_parameters(notebook: str, given: Mapping[str, Any]) -> Params:
-    """The parameter files' records for what a notebook was given; what is not given has the notebook's default.
-
-    Raises:
-        SessionError, ParameterError: in one sentence, if a name is unknown or a value cannot be used.
-    """
-    where = f"notebooks/{notebook}.ipynb"
-    for name in given:
-        if name not in NOTEBOOK_PARAMETERS:
-            raise SessionError(f"{where}: there is no parameter '{name}'; the parameters are {', '.join(NOTEBOOK_PARAMETERS)}")
-    for name, kind in NOTEBOOK_PARAMETERS.items():
-        if name in given and type(given[name]) is not kind:
-            words = "a whole number" if kind is int else "a text"
-            raise SessionError(f"{where}: parameter '{name}': expected {words}, found {given[name]!r}")
-    for name, least in (("seed", 0), ("seeds", 1)):
-        if given.get(name, least) < least:
-            raise SessionError(f"{where}: parameter '{name}': expected {least} or more, found {given[name]}")
-    params = load(Path(given.get("params_root") or PROJECT / "params").resolve(), given.get("case", 1))
-    for name, known in (("scale", params.learning.scales), ("variant", params.learning.variants)):
-        if name in given and given[name] not in known:
-            raise SessionError(f"{where}: parameter '{name}': expected one of {', '.join(known)}, found '{given[name]}'")
-    return params
 
 
 def _given(notebook: str, namespace: dict[str, Any]) -> tuple[dict[str, Any], Params]:

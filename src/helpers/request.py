@@ -1,0 +1,51 @@
+"""What a run is asked for: the names and values that a notebook may be given. Light to import, for command lines."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from helpers.params import Params, load
+
+PROJECT = Path(__file__).resolve().parents[2]
+NOTEBOOK_PARAMETERS = {
+    "case": int,
+    "seed": int,
+    "seeds": int,
+    "scale": str,
+    "variant": str,
+    "input_root": str,
+    "output_root": str,
+    "params_root": str,
+}
+
+
+class SessionError(ValueError):
+    """A notebook was given a parameter it does not have, or a value it cannot use."""
+
+    def _render_traceback_(self) -> list[str]:
+        """What IPython shows: the sentence alone."""
+        return [f"{type(self).__name__}: {self}"]
+
+
+def check_parameters(notebook: str, given: Mapping[str, Any]) -> Params:
+    """The parameter files' records for what a notebook was given; what is not given has the notebook's default.
+
+    Raises:
+        SessionError, ParameterError: in one sentence, if a name is unknown or a value cannot be used.
+    """
+    where = f"notebooks/{notebook}.ipynb"
+    for name in given:
+        if name not in NOTEBOOK_PARAMETERS:
+            raise SessionError(f"{where}: there is no parameter '{name}'; the parameters are {', '.join(NOTEBOOK_PARAMETERS)}")
+    for name, kind in NOTEBOOK_PARAMETERS.items():
+        if name in given and type(given[name]) is not kind:
+            words = "a whole number" if kind is int else "a text"
+            raise SessionError(f"{where}: parameter '{name}': expected {words}, found {given[name]!r}")
+    for name, least in (("seed", 0), ("seeds", 1)):
+        if given.get(name, least) < least:
+            raise SessionError(f"{where}: parameter '{name}': expected {least} or more, found {given[name]}")
+    params = load(Path(given.get("params_root") or PROJECT / "params").resolve(), given.get("case", 1))
+    for name, known in (("scale", params.learning.scales), ("variant", params.learning.variants)):
+        if name in given and given[name] not in known:
+            raise SessionError(f"{where}: parameter '{name}': expected one of {', '.join(known)}, found '{given[name]}'")
+    return params

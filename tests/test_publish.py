@@ -1,0 +1,138 @@
+"""What may become the committed reference run, and what goes into it."""
+
+import json
+
+import pandas as pd
+import pytest
+
+from helpers import publish
+from helpers.publish import PublishError, check
+
+REVISION = "0123abcd" * 5
+GOOD = {"scale": "paper", "revision": REVISION, "revisions_of_stages": [REVISION], "seeds": [0, 1]}
+OTHER = "f" * 40
+
+
+@pytest.mark.parametrize("reference", [None, {"seeds": [0]}, {"seeds": [0, 1]}], ids=["first", "more seeds", "as many"])
+def test_a_clean_run_at_paper_scale_is_accepted(reference):
+    check(GOOD, reference, REVISION)
+
+
+REFUSED = {
+    "smoke scale": ({"scale": "smoke"}, None, REVISION, "smoke scale"),
+    "fewer seeds": ({}, {"seeds": [0, 1, 2]}, REVISION, "2 seeds, the published one 3"),
+    "changed code now": ({}, None, REVISION + "+changes", "commit"),
+    "changed code then": ({"revision": REVISION + "+changes"}, None, REVISION, "+changes"),
+    "changed code all along": (
+        {"revision": REVISION + "+changes", "revisions_of_stages": [REVISION + "+changes"]},
+        None,
+        REVISION + "+changes",
+        "+changes",
+    ),
+    "one stage of changed code": ({"revisions_of_stages": [REVISION, REVISION + "+changes"]}, None, REVISION, "+changes"),
+    "a report of another commit": ({"revision": OTHER}, None, REVISION, OTHER),
+    "stages of another commit": ({"revisions_of_stages": [OTHER]}, None, REVISION, OTHER),
+    "another commit now": ({}, None, OTHER, OTHER),
+    "no checkout": ({"revision": "unknown", "revisions_of_stages": ["unknown"]}, None, "unknown", "unknown"),
+}
+
+
+@pytest.mark.parametrize(("changes", "reference", "revision", "says"), REFUSED.values(), ids=REFUSED)
+def test_other_runs_are_refused_in_one_sentence(changes, reference, revision, says):
+    with pytest.raises(PublishError) as caught:
+        check(GOOD | changes, reference, revision)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+# The command ---------------------------------------------------------------------------------------------------------
+
+README = "# Title\n<!-- glance: a -->\nold\n<!-- /glance -->\nmiddle\n<!-- time: b -->\n<!-- /time -->\nend\n"
+
+
+def comparison():
+    """Case 1 alone: the expert 1 % off; policies 10 % (paper) and 20 % (ours) from their experts."""
+    rows = [
+        {"case": 1, "row": row, "feature": feature, "published": scale * published, "reproduced": scale * reproduced, "n_seeds": 1}
+        for row, published, reproduced in (("expert", 1.0, 1.01), ("policy", 1.1, 0.808), ("alpha", 0.5, 0.4))
+        for feature, scale in (("C_A-I", 20.0), ("T-III", -22.0))
+    ]
+    return pd.DataFrame(rows)
+
+
+@pytest.fixture
+def project(monkeypatch, tmp_path):
+    """A project with a finished run."""
+    latest, results = tmp_path / "reports/latest", tmp_path / "results"
+    files = {
+        latest / "report.html": "<html>",
+        latest / "report.md": "# not published",
+        latest / "figures/figure_3.png": "picture",
+        latest / "tables/table_2.csv": "a,b",
+        latest / "tables/time.csv": "case,stage,seconds\n1,demonstrations,2.4\n2,demonstrations,3.6\n1,offline_improved,20.2\n",
+        latest / "tables/gaps.csv": "case,n_seeds,feature_gap,published_gap,expert_error\n1,1,0.2,0.1,0.01\n",
+        latest / "comparison.csv": comparison().to_csv(index=False),
+        latest / "seeds.csv": "case,seed,stage,metric,value\n1,0,offline,feature_gap,0.2\n",
+        latest / "provenance.json": json.dumps(GOOD),
+        latest / "notebooks/05_report.ipynb": "05",
+        results / "paper/seed_0/case_1/notebooks/02_offline_irl_improved.ipynb": "02",
+        results / "paper/seed_0/case_1/notebooks/02_offline_irl_printed.ipynb": "02 printed",
+        results / "paper/seed_0/case_3/notebooks/01_demonstrations.ipynb": "01",
+        results / "paper/seed_1/case_3/notebooks/01_demonstrations.ipynb": "01 of another seed",
+        tmp_path / "README.md": README,
+    }
+    for path, text in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    places = {"PROJECT": tmp_path, "LATEST": latest, "REFERENCE": tmp_path / "reports/reference", "RESULTS": results}
+    for name, value in places.items():
+        monkeypatch.setattr(publish, name, value)
+    monkeypatch.setattr(publish, "code_revision", lambda _: REVISION)
+    return tmp_path
+
+
+def test_publishing_copies_the_report_and_the_executed_notebooks_of_the_first_seed(project):
+    old = project / "reports/reference/old.txt"
+    old.parent.mkdir()
+    old.write_text("of the run before")
+    assert publish.main() == 0
+    reference = project / "reports/reference"
+    found = {str(path.relative_to(reference)) for path in reference.rglob("*") if path.is_file()}
+    assert found == {
+        *("report.html", "figures/figure_3.png", "tables/table_2.csv", "tables/time.csv", "tables/gaps.csv"),
+        *("comparison.csv", "seeds.csv", "provenance.json", "notebooks/05_report.ipynb"),
+        *("notebooks/02_offline_irl_case_1.ipynb", "notebooks/02_offline_irl_printed_case_1.ipynb"),
+        "notebooks/01_demonstrations_case_3.ipynb",
+    }
+    assert (reference / "notebooks/01_demonstrations_case_3.ipynb").read_text() == "01"
+    assert sorted(path.name for path in (project / "reports").iterdir()) == ["latest", "reference"]
+
+
+def test_publishing_writes_the_numbers_into_readme(project):
+    assert publish.main() == 0
+    lines = (project / "README.md").read_text(encoding="utf-8").splitlines()
+    (row,) = [line for line in lines if line.startswith("| I ")]
+    assert [cell.strip() for cell in row.strip("|").split("|")] == ["I", "1.0 %", "10.0 %", "20.0 %"]
+    assert any("offline_improved" in line and " 20 " in line for line in lines)
+    kept = [line for line in lines if line in README.splitlines()]
+    assert kept == ["# Title", "<!-- glance: a -->", "<!-- /glance -->", "middle", "<!-- time: b -->", "<!-- /time -->", "end"]
+
+
+@pytest.mark.parametrize("fault", ["no report", "smoke", "no marks in README"])
+def test_a_refused_run_changes_nothing(project, capsys, fault):
+    provenance = project / "reports/latest/provenance.json"
+    reference = project / "reports/reference"
+    reference.mkdir()
+    (reference / "provenance.json").write_text(json.dumps(GOOD | {"seeds": [0]}))
+    if fault == "no report":
+        provenance.unlink()
+    elif fault == "smoke":
+        provenance.write_text(json.dumps(GOOD | {"scale": "smoke"}))
+    else:
+        (project / "README.md").write_text("no marks")
+    before = {path: path.read_bytes() for path in project.rglob("*") if path.is_file()}
+    assert publish.main() == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ")
+    assert said.count("\n") == 1
+    assert {path: path.read_bytes() for path in project.rglob("*") if path.is_file()} == before

@@ -1,0 +1,74 @@
+"""README keeps its word: its numbers are those of the reference run, its commands and links exist."""
+
+import re
+import shlex
+
+import nbformat
+import pandas as pd
+import pytest
+
+from helpers.session import PROJECT
+
+README = (PROJECT / "README.md").read_text(encoding="utf-8")
+REFERENCE = PROJECT / "reports/reference"
+LINKS = sorted(set(re.findall(r"\]\(([^)#]+?)\)", README)))
+PERCENT = re.compile(r"(\d+(?:\.\d+)?) %")
+
+published = pytest.mark.skipif(not REFERENCE.is_dir(), reason="no run was published yet")
+
+
+def block(name):
+    """The lines between the marks of a block that `make publish` writes."""
+    (found,) = re.findall(rf"<!-- {name}:.*?-->\n(.*?)<!-- /{name} -->", README, re.DOTALL)
+    return found
+
+
+@published
+def test_the_comparison_at_a_glance_is_that_of_the_reference_run():
+    """Expert error and the paper's gap from comparison.csv, our gap from seeds.csv: the median over the seeds."""
+    compared = pd.read_csv(REFERENCE / "comparison.csv").set_index(["case", "row"])
+    seeds = pd.read_csv(REFERENCE / "seeds.csv").query("stage == 'offline' and metric == 'feature_gap'")
+    rows = [line for line in block("glance").splitlines() if "%" in line]
+    assert len(rows) == 3
+    for case, row in enumerate(rows, start=1):
+        expert, policy = compared.loc[(case, "expert")], compared.loc[(case, "policy")]
+        error = (expert["reproduced"] / expert["published"] - 1).abs().mean()
+        paper = (policy["published"].to_numpy() / expert["published"].to_numpy() - 1).__abs__().mean()
+        ours = seeds.query("case == @case")["value"].median()
+        assert re.search(rf"\| *{'I' * case} *\|", row)
+        found = [float(number) for number in PERCENT.findall(row)]
+        assert found == pytest.approx([100 * error, 100 * paper, 100 * ours], abs=0.051)
+    n_seeds = compared["n_seeds"].unique().tolist()
+    assert ("one seed" if n_seeds == [1] else f"{n_seeds[0]} seeds") in block("glance")
+
+
+@published
+def test_the_times_are_those_of_the_reference_run():
+    table = pd.read_csv(REFERENCE / "tables/time.csv")
+    rows = {line.split("|")[1].strip(): line for line in block("time").splitlines() if line.startswith("|")}
+    for stage, times in table.groupby("stage")["seconds"]:
+        assert re.findall(r"\b\d+\b", rows[stage].replace(stage, "")) == [f"{seconds:.0f}" for seconds in times]
+
+
+@pytest.mark.parametrize("link", [link for link in LINKS if "://" not in link])
+def test_links_lead_to_files(link):
+    if link.startswith("reports/reference") and not REFERENCE.is_dir():
+        pytest.skip("no run was published yet")
+    assert (PROJECT / link).exists()
+
+
+def test_the_targets_named_exist():
+    targets = set(re.findall(r"^(\w+):", (PROJECT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    named = set(re.findall(r"(?:^|`)make (\w+)", README, re.MULTILINE))
+    assert {"reports", "test", "smoke", "lab", "publish"} <= named <= targets
+
+
+def test_the_papermill_commands_name_notebooks_and_their_parameters():
+    commands = [shlex.split(line) for line in README.splitlines() if line.startswith("papermill ")]
+    assert {command[1][10:12] for command in commands} >= {"01", "02", "03", "04"}
+    for _, path, _, *options in commands:
+        cells = nbformat.read(PROJECT / path, as_version=4).cells
+        (parameters,) = [cell.source for cell in cells if "parameters" in cell.metadata.get("tags", [])]
+        for flag, name, _ in zip(*[iter(options)] * 3, strict=True):
+            assert flag == "-p"
+            assert re.search(rf"^{name} = ", parameters, re.MULTILINE)

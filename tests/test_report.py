@@ -1,0 +1,282 @@
+"""The report on the committed smoke results: complete, self-contained, readable, and refused when its input does not fit."""
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from itertools import product
+
+import pandas as pd
+import pytest
+
+from helpers import report
+from helpers.artifacts import ArtifactError
+from helpers.session import PROJECT
+
+CASES = (1, 2, 3)
+TABLE_OF_CASE = {1: 2, 2: 3, 3: 4}
+FEATURES = ["C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III"]
+COST = {"epochs", "episodes", "gradient_steps"}
+INPUTS, PARAMS = PROJECT / "notebooks/inputs", PROJECT / "params"
+VOID = {"meta", "link", "img", "br", "hr", "col", "input"}
+RESOURCES = {"src", "data", "srcset", "poster", "background"}
+
+
+def collect(root=INPUTS, params_root=PARAMS, n_seeds=1):
+    return report.collect(root, params_root, "smoke", CASES, n_seeds)
+
+
+@pytest.fixture(scope="module")
+def results():
+    return collect()
+
+
+@pytest.fixture(scope="module")
+def written(results, tmp_path_factory):
+    """The folder of a report, written where an older one and files of the user were."""
+    folder = tmp_path_factory.mktemp("report") / "latest"
+    for old in ("notebooks/05_report.ipynb", "notes.txt", "figures/figure_9.png", "tables/table_9.csv"):
+        (folder / old).parent.mkdir(parents=True, exist_ok=True)
+        (folder / old).write_text("old")
+    assert report.write(folder, results) == folder / "report.html"
+    return folder
+
+
+class Page(HTMLParser):
+    """What a reader of an HTML page meets: its elements, and its text outside style sheets and TeX annotations."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements, self.text, self.open = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs), tuple(self.open)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs), tuple(self.open)))
+
+    def handle_endtag(self, tag):
+        while self.open and self.open.pop() != tag:
+            pass
+
+    def handle_data(self, data):
+        if not {"style", "annotation", "head"} & set(self.open):
+            self.text.append(data)
+
+    def named(self, tag):
+        return [(attributes, inside) for name, attributes, inside in self.elements if name == tag]
+
+
+@pytest.fixture(scope="module")
+def page(written):
+    return Page((written / "report.html").read_text(encoding="utf-8"))
+
+
+# report.html ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_report_opens_without_a_network(page):
+    assert page.named("script") == []
+    assert page.named("iframe") == []
+    assert page.named("link") == []
+    sources = [attributes[name] for _, attributes, _ in page.elements for name in RESOURCES & attributes.keys()]
+    assert sources
+    assert all(source.startswith("data:") for source in sources)
+    assert "@import" not in (page_text := "".join(str(attributes) for _, attributes, _ in page.elements))
+    assert "url(http" not in page_text
+
+
+def test_links_inside_the_report_lead_somewhere(page):
+    places = {attributes["id"] for _, attributes, _ in page.elements if "id" in attributes}
+    targets = [attributes["href"] for attributes, _ in page.named("a") if "href" in attributes]
+    assert len(targets) > 5
+    assert all(target.startswith("https://") or target[1:] in places for target in targets)
+
+
+def test_maths_is_typeset_and_no_markup_shows_through(page):
+    assert len(page.named("math")) > 20
+    text = "".join(page.text)
+    for markup in (r"\$", r"\\", r"\*\*", r"\|--", "{{", "{%", r"!\[", r"\bnan\b", r"\bNone\b", "undefined"):
+        assert re.search(f".*{markup}.*", text) is None
+
+
+def test_every_figure_has_a_caption_and_alternative_text(page):
+    images = page.named("img")
+    assert len(images) == 3 + 4 * len(CASES)
+    for attributes, inside in images:
+        assert len(attributes.get("alt", "").split()) > 5, attributes.get("alt")
+        assert "figure" in inside
+    assert len({attributes["alt"] for attributes, _ in images}) == len(images)
+    assert len(page.named("figcaption")) == len(page.named("figure")) == len(images)
+    text = " ".join("".join(page.text).split())
+    assert all(f"Figure {number}. " in text for number in (3, 4, 5, 6))
+
+
+def test_tables_are_tables_with_headers(page):
+    text = " ".join("".join(page.text).split())
+    assert all(f"Table {number}. " in text for number in (1, 2, 3, 4))
+    rows = [inside for tag, _, inside in page.elements if tag == "tr"]
+    assert len(page.named("table")) >= 8
+    assert all("table" in inside for inside in rows)
+    assert len(page.named("thead")) == len(page.named("table"))
+
+
+def test_every_parameter_stands_in_the_report_with_unit_source_and_status(results, written, page):
+    leaves = {(leaf["file"], leaf["key"]): leaf for params in results.params.values() for leaf in params.leaves}
+    table = pd.read_csv(written / "tables/parameters.csv", dtype=str, keep_default_na=False)
+    assert set(zip(table["file"], table["key"], strict=True)) == leaves.keys()
+    assert (table[["value", "unit", "source", "status"]] != "").all(axis=None)
+    assert set(table["status"]) <= {"reported", "inferred", "assumed"}
+    text = " ".join("".join(page.text).split())
+    assert all(key in text for _, key in leaves)
+
+
+def test_the_report_says_where_it_comes_from_and_that_smoke_means_nothing(written, page):
+    text = " ".join("".join(page.text).split())
+    origin = json.loads((written / "provenance.json").read_text())
+    assert {"scale", "seeds", "revision", "revisions_of_stages", "versions", "parameters"} <= origin.keys()
+    assert origin["scale"] == "smoke"
+    assert origin["seeds"] == [0]
+    assert sorted(origin["parameters"]) == ["1", "2", "3"]
+    for part in (origin["revision"], f"torch {origin['versions']['torch']}", "Its numbers mean nothing", "Errata", "Deviations"):
+        assert part in text
+
+
+# The files beside it -------------------------------------------------------------------------------------------------
+
+
+def test_every_figure_and_table_of_the_paper_has_its_files(written):
+    figures = [f"figure_{number}" for number in range(1, 7)]
+    figures += ["network", *(f"{curves}_curves_case_{case}" for curves in ("learning", "online") for case in CASES)]
+    for name, ending in product(figures, ("svg", "png")):
+        assert (written / "figures" / f"{name}.{ending}").stat().st_size > 1000
+    for number, ending in product((1, 2, 3, 4), ("csv", "md")):
+        assert (written / "tables" / f"table_{number}.{ending}").stat().st_size > 100
+    for number in (2, 3, 4):
+        table = pd.read_csv(written / f"tables/table_{number}.csv")
+        assert table["source"].tolist() == ["published", "reproduced"] * 3
+        assert table[FEATURES].notna().all(axis=None)
+
+
+def test_what_an_older_report_left_is_replaced_and_other_files_stay(written):
+    assert (written / "notes.txt").read_text() == (written / "notebooks/05_report.ipynb").read_text() == "old"
+    assert not (written / "figures/figure_9.png").exists()
+    assert not (written / "tables/table_9.csv").exists()
+    assert [path.name for path in written.iterdir() if path.name.startswith(".")] == []
+
+
+def test_comparison_has_one_row_for_each_published_number(written):
+    table = pd.read_csv(written / "comparison.csv")
+    assert list(table) == ["table", "case", "row", "feature", "published", "reproduced", "n_seeds"]
+    keys = [(TABLE_OF_CASE[case], case, row, name) for case, row, name in product(CASES, ("expert", "policy", "alpha"), FEATURES)]
+    assert len(table) == 54
+    assert set(table[["table", "case", "row", "feature"]].itertuples(index=False, name=None)) == set(keys)
+    assert (table["n_seeds"] == 1).all()
+    assert table[["published", "reproduced"]].notna().all(axis=None)
+    found = table.set_index(["case", "row", "feature"])
+    assert found.loc[(1, "expert", "C_A-I"), "published"] == 21.63  # Table 2, first and last number of the paper
+    assert found.loc[(3, "alpha", "T-III"), "published"] == -0.541
+    for row, folder, metric in (
+        ("expert", "demonstrations", "v:T-II"),
+        ("policy", "transfer_improved", "v:T-II"),
+        ("alpha", "transfer_improved", "alpha:T-II"),
+    ):
+        scores = pd.read_csv(INPUTS / "smoke/seed_0/case_3" / folder / "scores.csv").set_index("metric")["value"]
+        assert found.loc[(3, row, "T-II"), "reproduced"] == pytest.approx(scores[metric], rel=1e-9)
+
+
+def test_seeds_hold_the_metrics_of_every_stage(written):
+    table = pd.read_csv(written / "seeds.csv")
+    assert list(table) == ["case", "seed", "stage", "metric", "value"]
+    assert table["metric"][table["value"].isna()].str.startswith("rise_time:").all()  # a loop may never arrive
+    assert not table.duplicated(["case", "seed", "stage", "metric"]).any()
+    v, alpha = ({f"{kind}:{name}" for name in FEATURES} for kind in ("v", "alpha"))
+    expected = {
+        "expert": v | {"objective"},
+        "offline": v | alpha | COST | {"feature_gap", "objective"},
+        "online": v | COST | {"objective"},
+    }
+    for case, (stage, metrics) in product(CASES, expected.items()):
+        assert metrics <= set(table.query("case == @case and stage == @stage")["metric"]), (case, stage)
+    assert table.query("metric == 'episodes'")["value"].gt(0).all()
+
+
+# What does not fit ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def inputs(tmp_path):
+    return shutil.copytree(INPUTS, tmp_path / "inputs")
+
+
+def refusal(*arguments):
+    with pytest.raises(ArtifactError) as caught:
+        collect(*arguments)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("missing", "says"),
+    [
+        ("case_2/demonstrations", "notebook 01 for case 2 and seed 0"),
+        ("case_1/offline_printed", "notebook 02 for case 1 and seed 0"),
+        ("case_3/transfer_improved", "notebook 04 for case 3 and seed 0"),
+        ("case_3/online_improved", "notebook 03 (04 for the transfer case) for case 3 and seed 0"),
+    ],
+)
+def test_a_missing_stage_names_its_file_and_what_to_run(inputs, missing, says):
+    shutil.rmtree(inputs / "smoke/seed_0" / missing)
+    path = inputs / "smoke/seed_0" / missing / "record.json"
+    assert refusal(inputs) == f"{path}: this result is missing; run {says} first"
+
+
+def test_a_seed_that_was_not_run_is_named(inputs):
+    assert "seed_1/case_1/demonstrations/record.json" in refusal(inputs, PARAMS, 2)
+
+
+def test_several_seeds_are_compared_by_their_median(inputs):
+    for seed in (1, 2):
+        shutil.copytree(inputs / "smoke/seed_0", inputs / f"smoke/seed_{seed}")
+    results = collect(inputs, PARAMS, 3)
+    assert set(results.seeds["seed"]) == {0, 1, 2}
+    assert set(report.tabulate(results)["comparison"]["n_seeds"]) == {3}
+    rows = results.seeds.query("case == 1 and stage == 'offline' and metric == 'v:T-I'")
+    results.seeds.loc[rows.index, "value"] = [9.0, 1.0, 2.0]
+    table = report.tabulate(results)["comparison"].set_index(["case", "row", "feature"])
+    assert table.loc[(1, "policy", "T-I"), "reproduced"] == 2.0
+
+
+def test_a_stage_made_with_other_parameters_is_refused_by_name(inputs, tmp_path):
+    params = shutil.copytree(PARAMS, tmp_path / "params")
+    case = params / "case_2.yaml"
+    case.write_text(case.read_text().replace("value: 250", "value: 249"))
+    sentence = refusal(inputs, params)
+    assert "case_2/demonstrations/record.json: made with other parameters" in sentence
+    assert str(params) in sentence
+
+
+def test_a_record_without_its_parameters_is_refused(inputs):
+    path = inputs / "smoke/seed_0/case_1/demonstrations/record.json"
+    record = json.loads(path.read_text())
+    path.write_text(json.dumps({"files": record["files"]}))
+    assert str(path) in refusal(inputs)
+
+
+@pytest.mark.parametrize("broken", ["draw", "tabulate", "render", "typeset"])
+def test_a_report_that_fails_leaves_the_older_one_alone(results, tmp_path, monkeypatch, broken):
+    def fail(*_):
+        raise RuntimeError(broken)
+
+    for name, stand_in in (("draw", lambda _: {}), ("render", lambda *_: ""), (broken, fail)):
+        monkeypatch.setattr(report, name, stand_in)
+    for old in ("report.html", "figures/figure_3.svg"):
+        (tmp_path / old).parent.mkdir(exist_ok=True)
+        (tmp_path / old).write_text("old")
+    with pytest.raises(RuntimeError, match=broken):
+        report.write(tmp_path, results)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["figure_3.svg", "figures", "report.html"]
+    assert (tmp_path / "report.html").read_text() == "old"

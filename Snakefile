@@ -1,5 +1,6 @@
 # The order of the stages for each case and seed. Every stage is one notebook, executed by helpers.run.
 # Settings (snakemake --config name=value): seeds (how many), scale (smoke or paper), variants, results, reports.
+import shlex
 import sys
 from pathlib import Path
 
@@ -12,11 +13,13 @@ VARIANTS = ["improved", "printed"]
 CASES = [1, 2, 3]
 CASE = f"{RESULTS}/{SCALE}/seed_{{seed}}/case_{{case}}"
 LOG = f"{RESULTS}/{SCALE}/seed_{{seed}}/case_{{case}}/notebooks"
-RUN = f"{sys.executable} -m helpers.run"
-ROOTS = f"-p scale {SCALE} -p input_root {Path(RESULTS).resolve()} -p output_root {Path(RESULTS).resolve()}"
+RUN = f"{shlex.quote(sys.executable)} -m helpers.run"
+FOLDER = shlex.quote(str(Path(RESULTS).resolve()))
+ROOTS = f"-p scale {SCALE} -p input_root {FOLDER} -p output_root {FOLDER}"
 
 # What a stage's result depends on beside earlier stages: its notebook, its parameter files and the modules behind it.
-MODULES = [str(path) for path in sorted((ROOT / "src/helpers").glob("*.py")) if path.stem not in ("figures", "tables", "report", "run")]
+UNRELATED = ("tables", "report", "run", "publish", "refresh")
+MODULES = [str(path) for path in sorted((ROOT / "src/helpers").glob("*.py")) if path.stem not in UNRELATED]
 PARAMS = [str(ROOT / "params" / f"{name}.yaml") for name in ("process", "demonstrators", "features", "learning")]
 
 
@@ -51,7 +54,7 @@ rule demonstrations:
     log:
         f"{LOG}/01_demonstrations.ipynb",
     shell:
-        f"{RUN} 01_demonstrations {{log}} -p case {{wildcards.case}} -p seed {{wildcards.seed}} {ROOTS}"
+        f"{RUN} 01_demonstrations {{log:q}} -p case {{wildcards.case}} -p seed {{wildcards.seed}} {ROOTS}"
 
 
 rule offline:
@@ -63,7 +66,7 @@ rule offline:
     log:
         f"{LOG}/02_offline_irl_{{variant}}.ipynb",
     shell:
-        f"{RUN} 02_offline_irl {{log}} -p case {{wildcards.case}} -p seed {{wildcards.seed}} -p variant {{wildcards.variant}} {ROOTS}"
+        f"{RUN} 02_offline_irl {{log:q}} -p case {{wildcards.case}} -p seed {{wildcards.seed}} -p variant {{wildcards.variant}} {ROOTS}"
 
 
 rule online:
@@ -78,7 +81,7 @@ rule online:
     log:
         f"{LOG}/03_online_improvement_{{variant}}.ipynb",
     shell:
-        f"{RUN} 03_online_improvement {{log}} -p case {{wildcards.case}} -p seed {{wildcards.seed}} -p variant {{wildcards.variant}} {ROOTS}"
+        f"{RUN} 03_online_improvement {{log:q}} -p case {{wildcards.case}} -p seed {{wildcards.seed}} -p variant {{wildcards.variant}} {ROOTS}"
 
 
 rule transfer:
@@ -92,7 +95,7 @@ rule transfer:
     log:
         f"{RESULTS}/{SCALE}/seed_{{seed}}/case_3/notebooks/04_knowledge_transfer_{{variant}}.ipynb",
     shell:
-        f"{RUN} 04_knowledge_transfer {{log}} -p case 3 -p seed {{wildcards.seed}} -p variant {{wildcards.variant}} {ROOTS}"
+        f"{RUN} 04_knowledge_transfer {{log:q}} -p case 3 -p seed {{wildcards.seed}} -p variant {{wildcards.variant}} {ROOTS}"
 
 
 def finished(wildcards):
@@ -112,7 +115,8 @@ rule report:
     input:
         sources("05_report"),
         published=str(ROOT / "params/published.yaml"),
-        modules=[str(ROOT / f"src/helpers/{name}.py") for name in ("figures", "tables", "report")],
+        modules=[str(ROOT / f"src/helpers/{name}.py") for name in ("tables", "report")],
+        template=[str(path) for path in sorted((ROOT / "reports/template").iterdir())],
         stages=finished,
     output:
         f"{REPORTS}/report.html",
@@ -122,5 +126,5 @@ rule report:
     params:
         seeds=len(SEEDS),
     shell:
-        f"{RUN} 05_report {{log}} -p seeds {{params.seeds}} -p scale {SCALE} -p input_root {Path(RESULTS).resolve()}"
-        f" -p output_root {Path(REPORTS).resolve()}"
+        f"{RUN} 05_report {{log:q}} -p seeds {{params.seeds}} -p scale {SCALE} -p input_root {FOLDER}"
+        f" -p output_root {shlex.quote(str(Path(REPORTS).resolve()))}"

@@ -44,11 +44,11 @@ def test_tables_come_back_to_the_last_bit(saved):
     assert sorted(saved.record["files"]) == ["note.txt", "table.csv"]
 
 
-class Fault(RuntimeError):
+class FaultError(RuntimeError):
     """Something that goes wrong in the middle of writing."""
 
 
-class Faulty:
+class Broken:
     """A table, or a figure, that cannot be written."""
 
     def __init__(self, error):
@@ -61,18 +61,20 @@ class Faulty:
 
 
 @pytest.mark.parametrize("kind", ["tables", "figures"])
-@pytest.mark.parametrize(("error", "raised"), [(Fault("bug"), Fault), (OSError(28, "No space left on device"), ArtifactError)])
+@pytest.mark.parametrize(
+    ("error", "raised"), [(FaultError("bug"), FaultError), (OSError(28, "No space left on device"), ArtifactError)]
+)
 def test_a_failure_in_the_middle_leaves_the_older_results_alone(saved, kind, error, raised):
     before = {path.name: path.read_bytes() for path in saved.folder.iterdir()}
-    with pytest.raises(raised, match="bug|No space left"):
-        save_stage(saved.folder, {"seed": 4}, **{kind: {"new.csv": Faulty(error)}})
+    with pytest.raises(raised, match=r"bug|No space left"):
+        save_stage(saved.folder, {"seed": 4}, **{kind: {"new.csv": Broken(error)}})
     assert {path.name: path.read_bytes() for path in saved.folder.iterdir()} == before
     assert [path.name for path in saved.folder.parent.iterdir()] == ["stage"]
 
 
 def test_a_failure_in_the_middle_of_a_first_run_leaves_nothing(folder):
-    with pytest.raises(Fault):
-        save_stage(folder, {}, {"a.csv": AWKWARD, "b.csv": Faulty(Fault())})
+    with pytest.raises(FaultError):
+        save_stage(folder, {}, {"a.csv": AWKWARD, "b.csv": Broken(FaultError())})
     assert list(folder.parent.iterdir()) == []
 
 

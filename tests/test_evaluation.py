@@ -62,7 +62,7 @@ def test_expected_features_are_the_mean_over_fresh_episodes(study):
 @pytest.mark.parametrize("case", [1, 2, 3])
 def test_expert_rows_of_the_published_tables(study, root, case):
     """20,000 trajectories: mean relative error to Tables 2, 3 and 4 at most 3 %."""
-    example, published = study(case), torch.tensor(load_published(root, case).expert, dtype=F64)
+    example, published = study(case), torch.tensor(load_published(root)[case].expert, dtype=F64)
     found = expected_features(example.process, example.pid, example.features, 20_000, stream(0, "expert", case))
     assert feature_gap(found.mean, published) <= 0.03
 
@@ -77,7 +77,7 @@ def test_relative_gap_is_counted_in_units_of_the_experts_size():
 @pytest.mark.parametrize(("case", "gap"), [(1, 0.037), (2, 0.137), (3, 0.115)])
 def test_feature_gap_of_the_published_rows(root, case, gap):
     """The paper's own rows, by a plain sum."""
-    table = load_published(root, case)
+    table = load_published(root)[case]
     by_hand = sum(abs(learned - shown) / abs(shown) for learned, shown in zip(table.policy, table.expert, strict=True)) / 6
     found = feature_gap(torch.tensor(table.policy, dtype=F64), torch.tensor(table.expert, dtype=F64))
     assert found == pytest.approx(by_hand, rel=1e-12)

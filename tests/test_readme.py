@@ -7,7 +7,7 @@ import nbformat
 import pandas as pd
 import pytest
 
-from helpers.session import PROJECT
+from helpers.request import PROJECT
 
 README = (PROJECT / "README.md").read_text(encoding="utf-8")
 REFERENCE = PROJECT / "reports/reference"

@@ -11,7 +11,7 @@ import pytest
 
 from helpers import report
 from helpers.artifacts import ArtifactError
-from helpers.session import PROJECT
+from helpers.request import PROJECT
 
 CASES = (1, 2, 3)
 TABLE_OF_CASE = {1: 2, 2: 3, 3: 4}

@@ -15,7 +15,8 @@ from safetensors.torch import save as save_tensors
 from helpers import stages
 from helpers.artifacts import ArtifactError
 from helpers.policy import LSTMPolicy
-from helpers.session import PROJECT, open_session
+from helpers.request import PROJECT
+from helpers.session import open_session
 
 EPOCHS_OF_THE_PAPER = {1: (300, [10, 10]), 2: (250, [10, 10]), 3: (80, [10, 10])}
 EPISODES_OF_AN_EPOCH = 500
@@ -121,7 +122,7 @@ def test_a_policy_comes_with_its_weights_also_from_another_case():
 @pytest.mark.parametrize("verb", ["load_demonstrations", "load_policy"])
 def test_a_missing_upstream_result_names_file_and_notebook(tmp_path, verb):
     action = partial(stages.load_policy, stage="offline_improved", made_by="02_offline_irl")
-    with pytest.raises(ArtifactError, match="record.json: this result is missing; run 0[12]_[a-z_]* for case 1 first"):
+    with pytest.raises(ArtifactError, match=r"record\.json: this result is missing; run 0[12]_[a-z_]* for case 1 first"):
         {"load_demonstrations": stages.load_demonstrations, "load_policy": action}[verb](session(input_root=str(tmp_path)))
 
 

@@ -104,7 +104,7 @@ def test_comparison_takes_the_median_over_the_seeds_of_the_right_stage() -> None
 
 
 def test_comparison_has_a_row_for_each_published_number() -> None:
-    published = {case: load_published(PARAMS, case) for case in (1, 2, 3)}
+    published = {case: load_published(PARAMS)[case] for case in (1, 2, 3)}
     table = tables.comparison(published, seeds().query("case == 2"), FEATURES)
     assert len(table) == 54
     assert table["reproduced"].isna().all()
@@ -123,7 +123,7 @@ def test_gaps() -> None:
 
 
 def test_gaps_of_the_paper_and_of_seeds_that_are_missing() -> None:
-    table = tables.gaps(seeds().query("case == 2"), {case: load_published(PARAMS, case) for case in (1, 2, 3)}, FEATURES)
+    table = tables.gaps(seeds().query("case == 2"), {case: load_published(PARAMS)[case] for case in (1, 2, 3)}, FEATURES)
     assert (100 * table["published_gap"]).round(1).tolist() == [3.7, 13.7, 11.5]
     assert table["n_seeds"].tolist() == [0, 0, 0]
     assert table[["feature_gap", "expert_error"]].isna().all(axis=None)
@@ -170,7 +170,7 @@ def test_markdown_numbers() -> None:
 
 def test_the_printed_rows_come_out_as_printed() -> None:
     same = dict.fromkeys(FEATURES, 0.0)
-    table = tables.results_table(load_published(PARAMS, 1), same, same, same, FEATURES)
+    table = tables.results_table(load_published(PARAMS)[1], same, same, same, FEATURES)
     shown = cells(tables.to_markdown(table, decimals=tables.RESULT_DECIMALS))
     assert shown[2][2:] == ["21.63", "20.68", "4.08", "7.93", "-22.87", "-22.43"]
     assert shown[6][2:] == ["0.137", "0.652", "-0.067", "-0.630", "-0.194", "-0.343"]
@@ -191,7 +191,7 @@ def test_markdown_text_is_typeset_or_escaped() -> None:
 def test_markdown_becomes_a_table_with_maths_in_html() -> None:
     pypandoc = pytest.importorskip("pypandoc")
     expert, policy, alpha = (dict.fromkeys(FEATURES, value) for value in (1.0, 2.0, np.nan))
-    table = tables.results_table(load_published(PARAMS, 1), expert, policy, alpha, FEATURES)
+    table = tables.results_table(load_published(PARAMS)[1], expert, policy, alpha, FEATURES)
     html = pypandoc.convert_text(tables.to_markdown(table), "html", format="markdown", extra_args=["--mathml"])
     assert html.count("<tr") == 7
     assert html.count("<math") == 6 + 6

@@ -53,7 +53,10 @@ class Stage:
     def table(self, name: str, columns: tuple[str, ...] = ()) -> pd.DataFrame:
         """A CSV table of the stage, which must have at least these columns."""
         path = self.path(name)
-        frame = pd.read_csv(path, float_precision="round_trip")
+        try:
+            frame = pd.read_csv(path)
+        except ValueError as error:  # pandas' own errors are kinds of it
+            raise ArtifactError(f"{path}: not a table: {' '.join(str(error).split())}; run the stage again") from error
         for column in columns:
             if column not in frame:
                 raise ArtifactError(f"{path}: the column '{column}' is missing; run the stage again")
@@ -195,7 +198,8 @@ def trajectories_from_table(
     signals = {}
     for prefix, names in groups.items():
         columns = [f"{prefix}_{name}" for name in names]
-        values = torch.tensor(ordered[columns].to_numpy(dtype=float)).reshape(n_trajectories, n_samples, len(names))
+        numbers = ordered[columns].apply(pd.to_numeric, errors="coerce")  # a word becomes nan
+        values = torch.tensor(numbers.to_numpy(dtype=float)).reshape(n_trajectories, n_samples, len(names))
         values = values.transpose(0, 1)[: n_samples - (prefix in ("u", "command"))]
         if not torch.isfinite(values).all():
             raise ArtifactError(f"{path}: columns {', '.join(columns)}: expected finite numbers")

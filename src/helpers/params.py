@@ -406,13 +406,16 @@ def load(root: Path, case: int) -> Params:
     )
 
 
-def load_published(root: Path, case: int) -> PublishedCase:
-    """The paper's table for a case."""
+def load_published(root: Path) -> dict[int, PublishedCase]:
+    """The paper's tables by case, from published.yaml."""
     path = root / "published.yaml"
-    raw = read_yaml(path)
-    if f"case_{case}" not in raw:
-        raise ParameterError(f"{path}: the key 'case_{case}' is missing")
-    return validate(PublishedCase, raw[f"case_{case}"], path, f"case_{case}")
+    published = {}
+    for key, entry in read_yaml(path).items():
+        number = key.removeprefix("case_")
+        if not key.startswith("case_") or not number.isdecimal():
+            raise ParameterError(f"{path}: key '{key}': expected case_ and a number")
+        published[int(number)] = validate(PublishedCase, entry, path, key)
+    return published
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

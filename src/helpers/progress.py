@@ -1,5 +1,7 @@
 """Progress of learning on the screen."""
 
+import os
+
 from tqdm.auto import tqdm
 
 from helpers.maxent_irl import IterationRecord
@@ -13,7 +15,7 @@ class ProgressBar:
     """
 
     def __init__(self, n_epochs: int, description: str) -> None:
-        self.bar = tqdm(total=n_epochs, desc=description, unit="epoch", leave=False)
+        self.bar = tqdm(total=n_epochs, desc=description, unit="epoch", leave=False, disable=bool(os.environ.get("TQDM_DISABLE")))
 
     def __call__(self, record: EpochRecord | IterationRecord) -> None:
         """Move to the record's epoch."""

@@ -10,12 +10,14 @@ import torch
 from torch import Tensor
 
 from helpers.features import FeatureMap, accumulated_error, discounts, normalised_error
+from helpers.lstm import Tape
 from helpers.params import LearnerParams
 from helpers.policy import LSTMPolicy, PolicyController
 from helpers.process import Process
 from helpers.rollout import rollout
 from helpers.trajectories import Trajectories
 
+BLOCK = 1000  # episodes whose gradient is computed at once: more would only take memory
 Reward = Callable[[Trajectories], Tensor]  # rewards R_1..R_T, shape (T, K)
 
 
@@ -147,12 +149,14 @@ class Learner:
         self.generator = generator
         self.optimiser = torch.optim.Adam(policy.parameters(), lr=params.learning_rate_start)
         self.epochs = self.episodes = self.gradient_steps = 0
+        self._tapes: list[Tape] = []
 
     def epoch(self, reward: Reward) -> EpochRecord:
         """One epoch: roll out, weigh, step. Raises TrainingError if the return or the gradient is not finite."""
         params, gamma, task = self.params, self.features.params.discount, self.features.task
         rate = annealed(params.learning_rate_start, params.learning_rate_end, self.epochs / max(1, self.total_epochs - 1))
-        controller = PolicyController(self.policy, task, exploring=True)
+        recording = self.n_episodes <= BLOCK
+        controller = PolicyController(self.policy, task, exploring=True, recording=recording, used=self._tapes)
         batch = rollout(self.process, controller, task, self.n_episodes, self.generator)
         rewards = reward(batch)
         returns = discounted_return(rewards, gamma)
@@ -168,7 +172,8 @@ class Learner:
         advantage = advantage / spread
         for group in self.optimiser.param_groups:
             group["lr"] = rate
-        std = self._ascend(batch, advantage)
+        self._tapes = controller.tapes
+        self._ascend(batch, advantage)
         self.epochs += 1
         self.episodes += self.n_episodes
         self._update_average()
@@ -179,40 +184,55 @@ class Learner:
             returns.mean().item(),
             returns.std().item() / self.n_episodes**0.5,
             rate,
-            std,
+            self._exploration(batch),
         )
 
-    def _ascend(self, batch: Trajectories, advantage: Tensor) -> float:
-        """Gradient steps on one batch, minibatch by minibatch; returns the mean standard deviation of the policy.
+    def _ascend(self, batch: Trajectories, advantage: Tensor) -> None:
+        """Gradient steps on one batch, minibatch by minibatch.
 
         With one minibatch this is the plain policy gradient; with more, every step after the first meets a batch that an
         older policy drew, and the clipped ratio corrects for it.
         """
-        task, params = self.features.task, self.params
+        params = self.params
         drawn = None
         if params.minibatches > 1:
             with torch.no_grad():
-                drawn = self.policy.log_probability(batch.y, batch.u, batch.command, task)
+                drawn = self._log_probability(batch, slice(None), self._tapes)
         for part in range(params.minibatches):
-            rows = slice(part, None, params.minibatches)
-            log_probability = self.policy.log_probability(batch.y[:, rows], batch.u[:, rows], batch.command[:, rows], task)
-            if drawn is None:
-                gain = surrogate(log_probability, advantage)
-            else:
-                gain = clipped_surrogate(log_probability, drawn[:, rows], advantage[:, rows], params.ratio_clip)
+            rows = range(self.n_episodes)[part :: params.minibatches]
+            tapes = self._tapes if part == 0 else []
             self.optimiser.zero_grad()
-            (-gain).backward()
-            rate = self.optimiser.param_groups[0]["lr"]
-            for name, parameter in self.policy.named_parameters():
-                if parameter.grad is not None and not parameter.grad.isfinite().all():
-                    raise TrainingError(
-                        f"epoch {self.epochs + 1}: the gradient of {name} is not finite at the learning rate {rate:g}"
-                    )
+            for first in range(0, len(rows), BLOCK):
+                block = rows[first : first + BLOCK]
+                index = slice(block.start, block.stop, block.step)
+                log_probability = self._log_probability(batch, index, tapes)
+                if drawn is None:
+                    gain = surrogate(log_probability, advantage[:, index])
+                else:
+                    gain = clipped_surrogate(log_probability, drawn[:, index], advantage[:, index], params.ratio_clip)
+                (-gain * len(block) / len(rows)).backward()
+            self._check_gradient()
             self.optimiser.step()
             self.gradient_steps += 1
+
+    def _log_probability(self, batch: Trajectories, rows: slice, tapes: list[Tape]) -> Tensor:
+        task = self.features.task
+        every = rows == slice(None) or len(range(self.n_episodes)[rows]) == self.n_episodes
+        chosen = tapes if every else [tape.rows(rows) for tape in tapes]
+        return self.policy.log_probability(batch.y[:, rows], batch.u[:, rows], batch.command[:, rows], task, chosen)
+
+    def _check_gradient(self) -> None:
+        rate = self.optimiser.param_groups[0]["lr"]
+        for name, parameter in self.policy.named_parameters():
+            if parameter.grad is not None and not parameter.grad.isfinite().all():
+                raise TrainingError(f"epoch {self.epochs + 1}: the gradient of {name} is not finite at the learning rate {rate:g}")
+
+    def _exploration(self, batch: Trajectories) -> float:
+        """Standard deviation of the policy as a share of the input range, along one trajectory."""
+        task = self.features.task
         with torch.no_grad():
             std = self.policy(batch.y[:, :1], batch.u[:, :1], task)[1]
-            return (std / (task.input_high - task.input_low)).mean().item()
+        return (std / (task.input_high - task.input_low)).mean().item()
 
     def _update_average(self) -> None:
         # The warm-up keeps the untrained first weights from lingering in the average.

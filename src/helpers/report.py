@@ -28,7 +28,12 @@ OFFLINE = {"offline": "improved", "offline_printed": "printed"}  # stage in seed
 SCRATCH = "offline_improved"  # of a case that starts from another: the same learning without the transfer
 MADE_BY = {"demonstrations": "01", "offline": "02", "online": "03 (04 for the transfer case)", "transfer": "04"}
 LEARNING = {"offline": "improved", "offline_printed": "printed", "offline_scratch": "improved, from scratch"}
-CONTROLLERS = {"expert": "PID", "offline": "offline policy", "online": "online policy", "online_y": "online policy, learned on y"}
+CONTROLLERS = {
+    "expert_paired": "PID",
+    "offline": "offline policy",
+    "online": "online policy",
+    "online_y": "online policy, learned on y",
+}
 
 
 @dataclass(frozen=True)
@@ -87,7 +92,7 @@ def collect(root: Path, params_root: Path, scale: str, cases: tuple[int, ...], n
     stages: dict[tuple[int, int, str], Stage] = {}
     frames = []
     for case, record in params.items():
-        folders = {DEMONSTRATIONS: {"expert": "expert"}, ONLINE: {"online": "online", "online_y": "online_y"}}
+        folders = {DEMONSTRATIONS: {"expert": "expert"}, ONLINE: {name: name for name in ("expert_paired", "online", "online_y")}}
         folders |= {_offline_folder(record, variant): {"offline": name} for name, variant in OFFLINE.items()}
         if record.case.offline.transfer_from is not None:
             folders[SCRATCH] = {"offline": "offline_scratch"}
@@ -96,7 +101,7 @@ def collect(root: Path, params_root: Path, scale: str, cases: tuple[int, ...], n
                 notebook = MADE_BY[folder.split("_")[0]]
                 path = root / scale / f"seed_{seed}" / f"case_{case}" / folder
                 stage = load_stage(path, f"notebook {notebook} for case {case} and seed {seed}")
-                if stage.record["parameters"] != parameters_hash(record):
+                if stage.record.get("parameters") != parameters_hash(record):
                     raise ArtifactError(
                         f"{path / 'record.json'}: made with other parameters than {params_root} holds now; run it again"
                     )
@@ -104,7 +109,7 @@ def collect(root: Path, params_root: Path, scale: str, cases: tuple[int, ...], n
                 scores = stage.table("scores.csv", ("stage", "metric", "value"))
                 frames.append(scores.assign(case=case, seed=seed, stage=scores["stage"].map(names)))
     seeds = pd.concat(frames, ignore_index=True)[["case", "seed", "stage", "metric", "value"]]
-    return Results(scale, params, {case: load_published(params_root, case) for case in cases}, stages, seeds)
+    return Results(scale, params, {case: load_published(params_root)[case] for case in cases}, stages, seeds)
 
 
 def draw(results: Results) -> dict[str, Figure]:
@@ -250,6 +255,8 @@ def write(folder: Path, results: Results) -> Path:
             if target.is_dir():
                 shutil.rmtree(target)
             path.replace(target)
+    except OSError as error:
+        raise ArtifactError(f"{folder}: the report could not be written: {error.strerror}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return folder / "report.html"

@@ -1,5 +1,7 @@
 """What a run is asked for: the names and values that a notebook may be given. Light to import, for command lines."""
 
+import ast
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,17 @@ class SessionError(ValueError):
         return [f"{type(self).__name__}: {self}"]
 
 
+def parameter_names(notebook: str) -> list[str]:
+    """The names in a notebook's own parameters cell: not every notebook takes every parameter."""
+    cells = json.loads((PROJECT / f"notebooks/{notebook}.ipynb").read_text(encoding="utf-8"))["cells"]
+    source = next("".join(cell["source"]) for cell in cells if "parameters" in cell["metadata"].get("tags", []))
+    return [
+        node.targets[0].id
+        for node in ast.parse(source).body
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
+    ]
+
+
 def check_parameters(notebook: str, given: Mapping[str, Any]) -> Params:
     """The parameter files' records for what a notebook was given; what is not given has the notebook's default.
 
@@ -34,9 +47,10 @@ def check_parameters(notebook: str, given: Mapping[str, Any]) -> Params:
         SessionError, ParameterError: in one sentence, if a name is unknown or a value cannot be used.
     """
     where = f"notebooks/{notebook}.ipynb"
+    names = parameter_names(notebook)
     for name in given:
-        if name not in NOTEBOOK_PARAMETERS:
-            raise SessionError(f"{where}: there is no parameter '{name}'; the parameters are {', '.join(NOTEBOOK_PARAMETERS)}")
+        if name not in names:
+            raise SessionError(f"{where}: there is no parameter '{name}'; the parameters are {', '.join(names)}")
     for name, kind in NOTEBOOK_PARAMETERS.items():
         if name in given and type(given[name]) is not kind:
             words = "a whole number" if kind is int else "a text"

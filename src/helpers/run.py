@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -61,16 +62,26 @@ def execute(notebook: str, output: Path, parameters: dict[str, Any]) -> None:
 def strip_machine(path: Path) -> None:
     """Take papermill's paths and times out of an executed notebook, so that it can be compared and published."""
     notebook = nbformat.read(path, as_version=4)
-    notebook.metadata.pop("papermill", None)
+    for name in ("papermill", "widgets"):
+        notebook.metadata.pop(name, None)
     for cell in notebook.cells:
         cell.metadata.pop("papermill", None)
         cell.metadata.pop("execution", None)
+        if "injected-parameters" in cell.metadata.get("tags", []):
+            cell.source = re.sub(r'(?m)^(\w+_root) = ".+"$', r'\1 = ""  # a folder of the machine that ran this', cell.source)
         tags = [tag for tag in cell.metadata.get("tags", []) if tag != "papermill-error-cell-tag"]
         if tags:
             cell.metadata["tags"] = tags
         else:
             cell.metadata.pop("tags", None)
     nbformat.write(notebook, path)
+
+
+def _value(name: str, text: str) -> str | int:
+    """A parameter from the command line: folders are those of the caller's directory, for the kernel works elsewhere."""
+    if name.endswith("_root"):
+        return str(Path(text).resolve()) if text else ""
+    return int(text) if re.fullmatch(r"-?[0-9]+", text) else text
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -83,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     given = parser.parse_args(arguments)
     os.environ["TQDM_DISABLE"] = "1"
-    parameters = {name: int(value) if value.lstrip("-").isdigit() else value for name, value in given.parameter}
+    parameters = {name: _value(name, text) for name, text in given.parameter}
     what = " ".join([given.notebook, *(f"{name}={value}" for name, value in parameters.items() if not name.endswith("_root"))])
     try:
         execute(given.notebook, given.output, parameters)

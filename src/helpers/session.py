@@ -20,7 +20,7 @@ from helpers.params import Params, PublishedCase, ScaleParams, VariantParams, lo
 from helpers.policy import LSTMPolicy
 from helpers.process import LinearProcess
 from helpers.randomness import stream
-from helpers.request import NOTEBOOK_PARAMETERS, PROJECT, check_parameters
+from helpers.request import NOTEBOOK_PARAMETERS, PROJECT, SessionError, check_parameters, parameter_names
 from helpers.task import ControlTask
 
 PLAIN = (str, int, float, list, dict, type(None))
@@ -50,9 +50,19 @@ class Session:
         return getattr(torch, self.scale_params.number_type)
 
     @property
-    def published(self) -> PublishedCase:
-        """The paper's table for this case."""
-        return load_published(self.params_root, self.case)
+    def published(self) -> PublishedCase | None:
+        """The paper's table for this case; None for a case of your own."""
+        return load_published(self.params_root).get(self.case)
+
+    def expect_transfer(self, expected: bool) -> None:
+        """Refuse a case that belongs to another notebook: one that starts from another case, or one that does not."""
+        if (self.params.case.offline.transfer_from is not None) != expected:
+            rule = "names a case to start from" if not expected else "names no case to start from"
+            other = "04_knowledge_transfer" if not expected else "03_online_improvement"
+            raise SessionError(
+                f"notebooks/{self.notebook}.ipynb: parameter 'case': params/case_{self.case}.yaml {rule} "
+                f"(key 'offline.transfer_from'), so it belongs to notebooks/{other}.ipynb"
+            )
 
     @cached_property
     def process(self) -> LinearProcess:
@@ -165,6 +175,9 @@ def _given(notebook: str, namespace: dict[str, Any]) -> tuple[dict[str, Any], Pa
         if name in NOTEBOOK_PARAMETERS
         or (first_time and not name.startswith("_") and name not in IPYTHON_NAMES and isinstance(value, PLAIN))
     }
+    for name in parameter_names(notebook):
+        if name not in given:
+            raise SessionError(f"notebooks/{notebook}.ipynb: parameter '{name}' is not set; run the cell of parameters first")
     params = check_parameters(notebook, given)
     namespace["_session_opened"] = True
     # Whole tables in the plain text of an output too, which is what nbval compares.
@@ -212,10 +225,10 @@ def open_session(notebook: str, namespace: dict[str, Any]) -> Session:
 
 
 def open_report(notebook: str, namespace: dict[str, Any]) -> ReportSession:
-    """`open_session` for the report's notebook, which has no case of its own: the cases are those of the parameter files."""
+    """`open_session` for the report's notebook, which has no case of its own: the cases are those that the paper printed."""
     given, _ = _given(notebook, namespace)
     params_root = _root(given, "params_root", "params")
-    cases = sorted(int(path.stem.removeprefix("case_")) for path in params_root.glob("case_*.yaml"))
+    cases = sorted(load_published(params_root))
     return ReportSession(
         cases=tuple(cases),
         seeds=given["seeds"],

@@ -8,7 +8,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from helpers.artifacts import trajectories_from_table
+from helpers.artifacts import ArtifactError, trajectories_from_table
 from helpers.controllers import Controller
 from helpers.evaluation import feature_gap, relative_gap, scores
 from helpers.features import FeatureMap
@@ -57,6 +57,8 @@ def load_policy(session: Session, stage: str, made_by: str, case: int | None = N
     """The policy and the weights alpha* of an earlier offline stage, maybe of another case."""
     found = session.load(stage, made_by, case)
     weights = found.table("weights.csv", ("feature", "alpha"))
+    if weights["feature"].tolist() != session.feature_names or not pd.api.types.is_numeric_dtype(weights["alpha"]):
+        raise ArtifactError(f"{found.path('weights.csv')}: expected a number for each of {', '.join(session.feature_names)}")
     alpha = torch.tensor(weights["alpha"].to_numpy(), dtype=session.dtype)
     return found.policy(session.params.learning, session.task), alpha
 
@@ -137,6 +139,30 @@ def judge_imitation(
     rows |= {f"gap:{name}": value for name, value in zip(names, relative_gap(mean, truth).tolist(), strict=True)}
     rows |= {f"alpha:{name}": value for name, value in zip(names, result.weights.tolist(), strict=True)}
     return rows | {"chosen_epoch": float(result.chosen_epoch)} | cost(last)
+
+
+def feature_table(session: Session, scores: Mapping[str, float], demonstrations: Demonstrations) -> pd.DataFrame:
+    """Features of policy and expert, their gap in per cent and alpha*, beside the paper's rows; a row for each feature."""
+    names = session.feature_names
+    columns: dict[str, Any] = {
+        "expert": demonstrations.true_features(names),
+        "policy": [scores[f"v:{name}"] for name in names],
+        "gap, %": [100 * scores[f"gap:{name}"] for name in names],
+        "alpha*": [scores[f"alpha:{name}"] for name in names],
+    }
+    if session.published is not None:
+        columns |= {f"published {row}": getattr(session.published, row) for row in ("expert", "policy", "alpha")}
+    return pd.DataFrame(columns, index=names).astype(float)
+
+
+def outcome(session: Session, scores: Mapping[str, float]) -> pd.DataFrame:
+    """The feature gap, the paper's own, and what learning cost."""
+    rows = {"feature gap, %": 100 * scores["feature_gap"]}
+    if session.published is not None:
+        printed = torch.tensor([session.published.policy, session.published.expert])
+        rows["feature gap of the paper, %"] = 100 * feature_gap(*printed)
+    rows |= {name.replace("_", " "): scores[name] for name in ("chosen_epoch", "epochs", "episodes", "gradient_steps")}
+    return pd.Series(rows).to_frame("value")
 
 
 def judge_improvement(session: Session, trajectories: Trajectories, result: Improvement) -> dict[str, float]:

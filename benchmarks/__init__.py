@@ -1,0 +1,1 @@
+"""How fast learning is, and against what: `python -m benchmarks.benchmark --help`."""

@@ -1,0 +1,135 @@
+"""An LSTM layer, features first: one step, and the gradient through time written out.
+
+The mathematics is that of torch.nn.LSTM, whose parameters it takes. It exists for speed: a rollout needs one step at a
+time, and the gradient can start from what the rollout has computed already. Arrays have their features first and the
+trajectories last, so that every gate is a contiguous block.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+# d z from d a, where a = sigmoid(z) or a = tanh(z), as torch's own backward passes compute it.
+sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input
+tanh_backward = torch.ops.aten.tanh_backward.default
+tanh_backward_into = torch.ops.aten.tanh_backward.grad_input
+
+
+@dataclass(frozen=True)
+class Tape:
+    """All that one layer computed along its last T steps of K trajectories; n cells, n_in inputs.
+
+    A tape as long as the episode holds what the gradient needs; a tape of one step is all that control needs.
+
+    Attributes:
+        signals: [x_t, h_{t-1}] for t = 0..T, shape (T + 1, n_in + n, K); the last x is never set.
+        gates: i_t, f_t, g_t and o_t after their activations, shape (T, 4 n, K).
+        cells: c_{t-1} for t = 0..T, shape (T + 1, n, K).
+    """
+
+    signals: Tensor
+    gates: Tensor
+    cells: Tensor
+
+    @classmethod
+    def blank(cls, n_steps: int, weight: Tensor, n_trajectories: int, used: "Tape | None" = None) -> "Tape":
+        """A tape at its start, hidden and cell state zero, for a layer with the stacked weights (4 n, n_in + n).
+
+        A used tape of the same shape is wound back instead: new memory costs as much time as filling it.
+        """
+        width = weight.shape[0] // 4
+        shape = (n_steps, weight.shape[0], n_trajectories)
+        tape = (
+            used
+            if used is not None and used.gates.shape == shape and used.gates.dtype == weight.dtype
+            else cls(
+                signals=weight.new_empty(n_steps + 1, weight.shape[1], n_trajectories),
+                gates=weight.new_empty(n_steps, weight.shape[0], n_trajectories),
+                cells=weight.new_empty(n_steps + 1, width, n_trajectories),
+            )
+        )
+        tape.signals[0, -width:] = 0
+        tape.cells[0] = 0
+        return tape
+
+    def rows(self, rows: slice) -> "Tape":
+        """The same for some of the trajectories."""
+        return Tape(*(entry[..., rows].contiguous() for entry in (self.signals, self.gates, self.cells)))
+
+    @property
+    def hidden(self) -> Tensor:
+        """h_0..h_{T-1}, shape (T, n, K)."""
+        return self.signals[1:, -self.cells.shape[1] :]
+
+    def step(self, t: int, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """h_t from x_t (n_in, K) and what the tape holds of step t - 1; shape (n, K).
+
+        (i, f, g, o) = W [x, h] + b, with the logistic function on i, f and o and tanh on g; c' = f c + i g; h' = o tanh(c').
+        """
+        width = self.cells.shape[1]
+        now, after = t % len(self.signals), (t + 1) % len(self.signals)
+        self.signals[now, :-width] = x
+        gates = torch.addmm(bias, weight, self.signals[now], out=self.gates[t % len(self.gates)])
+        entry, forget, candidate, exit_ = gates.split(width)
+        gates[: 2 * width].sigmoid_()
+        candidate.tanh_()
+        exit_.sigmoid_()
+        cell = torch.mul(forget, self.cells[now], out=self.cells[after]).addcmul_(entry, candidate)
+        return torch.mul(exit_, cell.tanh(), out=self.signals[after, -width:])
+
+
+def stacked(layer: nn.LSTM) -> tuple[Tensor, Tensor]:
+    """The layer's parameters as one matrix on [x, h], shape (4 n, n_in + n), and one bias, shape (4 n, 1)."""
+    from_below, from_before, bias_below, bias_before = layer.all_weights[0]
+    return torch.cat([from_below, from_before], dim=1), (bias_below + bias_before)[:, None]
+
+
+class Unroll(torch.autograd.Function):
+    """h_0..h_{T-1}, shape (T, n, K), from x_0..x_{T-1}, shape (T, n_in, K): an LSTM layer with its gradient through time.
+
+    With the tape of a rollout under the same parameters nothing is computed twice. A tape serves for one gradient only.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, inputs: Tensor, weight: Tensor, bias: Tensor, tape: Tape | None = None) -> Tensor:
+        """The hidden states, from the tape if there is one."""
+        if tape is None:
+            tape = Tape.blank(len(inputs), weight, inputs.shape[-1])
+            for t, x in enumerate(inputs):
+                tape.step(t, x, weight, bias)
+        ctx.tape = tape
+        ctx.save_for_backward(weight)
+        return tape.hidden
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, Tensor, None]:
+        """Backpropagation through time; `d_z` is the gradient of the loss in z. It spends the tape.
+
+        Step by step, so that what a step needs stays in the processor's cache, and the gradients in the gates before their
+        activation take the place of the gates.
+        """
+        (d_hidden,) = gradients
+        (weight,) = ctx.saved_tensors
+        signals, gates, cells = ctx.tape.signals, ctx.tape.gates, ctx.tape.cells
+        width = cells.shape[1]
+        recurrent = weight[:, -width:].T.contiguous()
+        d_later = torch.zeros_like(cells[0])  # the part of d_h that comes from step t + 1
+        d_cell = torch.zeros_like(cells[0])
+        for t in reversed(range(len(gates))):
+            entry, forget, candidate, exit_ = gates[t].split(width)
+            squashed = cells[t + 1].tanh()
+            d_h = d_hidden[t] + d_later
+            d_cell += tanh_backward(d_h * exit_, squashed)
+            d_before = d_cell * forget
+            d_candidate = d_cell * entry
+            sigmoid_backward(d_h.mul_(squashed), exit_, grad_input=exit_)
+            sigmoid_backward(d_cell * candidate, entry, grad_input=entry)
+            sigmoid_backward(d_cell.mul_(cells[t]), forget, grad_input=forget)
+            tanh_backward_into(d_candidate, candidate, grad_input=candidate)
+            d_cell = d_before
+            d_later = recurrent @ gates[t]
+        d_inputs = weight[:, :-width].T @ gates if ctx.needs_input_grad[0] else None
+        d_weight = torch.bmm(gates, signals[:-1].mT).sum(0)
+        return d_inputs, d_weight, gates.sum((0, 2))[:, None], None

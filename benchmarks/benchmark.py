@@ -1,7 +1,6 @@
 """Measure how fast learning is: `python -m benchmarks.benchmark --help`; `make bench` installs what it needs and runs it."""
 
 import argparse
-import gc
 import subprocess
 import sys
 import time
@@ -27,6 +26,8 @@ from benchmarks.subjects import (
 )
 
 FLOATS = "%.6g"
+ENOUGH_SECONDS = 75.0  # no further round begins after that long, on a machine that is slow or busy
+FEWEST_ROUNDS = 3
 
 
 def timed(subject: Subject) -> float:
@@ -41,16 +42,19 @@ def in_rounds(subjects: Sequence[Subject], rounds: int) -> dict[Subject, list[fl
     """Seconds of every subject in every round.
 
     Each round meets every subject once, so that what else happens on the machine falls on all alike. An extra round
-    before them is not counted: it warms caches and allocators.
+    before them is not counted: it warms caches and allocators. On a slow or busy machine there are fewer rounds.
     """
     timings: dict[Subject, list[float]] = {subject: [] for subject in subjects}
+    begun = time.perf_counter()
     for number in range(rounds + 1):
+        if number > FEWEST_ROUNDS and time.perf_counter() - begun > ENOUGH_SECONDS:
+            say("  enough: the machine is slow or busy")
+            break
         started = time.perf_counter()
         for subject in subjects:
             seconds = timed(subject)
             if number:
                 timings[subject].append(seconds)
-        gc.collect()
         say(f"  {'warm-up' if number == 0 else f'round {number} of {rounds}'}: {time.perf_counter() - started:.1f} s")
     return timings
 

@@ -11,7 +11,7 @@ export OPENBLAS_NUM_THREADS := 1
 export MPLBACKEND := agg
 SNAKEMAKE = $(BIN)/python -m snakemake --profile profiles/local --cores $(CORES)
 
-.PHONY: help setup reports smoke test lab publish notebooks clean
+.PHONY: help setup reports smoke test lab bench publish notebooks clean
 
 help:  ## show this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-10s %s\n", $$1, $$2}'
@@ -42,6 +42,10 @@ test: setup  ## style, types, layers, tests and the notebooks against their stor
 
 lab: setup  ## open JupyterLab on the notebooks
 	$(BIN)/python -m jupyter lab notebooks
+
+bench: setup  ## measure speed against the machine's bound and other ways; writes reports/reference/benchmarks
+	$(BIN)/python -m pip install --quiet --constraint environment.txt --editable ".[bench]"
+	$(BIN)/python -m benchmarks.benchmark --whole --cores $(CORES)
 
 publish: setup  ## copy reports/latest to reports/reference
 	$(BIN)/python -m helpers.publish

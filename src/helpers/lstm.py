@@ -24,7 +24,8 @@ class Tape:
     A tape as long as the episode holds what the gradient needs; a tape of one step is all that control needs.
 
     Attributes:
-        signals: [x_t, h_{t-1}] for t = 0..T, shape (T + 1, n_in + n, K); the last x is never set.
+        signals: [x_t, 1, h_{t-1}] for t = 0..T, shape (T + 1, n_in + 1 + n, K); the last x is never set. The row of ones
+            carries the bias, so that one product makes all gates.
         gates: i_t, f_t, g_t and o_t after their activations, shape (T, 4 n, K).
         cells: c_{t-1} for t = 0..T, shape (T + 1, n, K).
     """
@@ -35,21 +36,20 @@ class Tape:
 
     @classmethod
     def blank(cls, n_steps: int, weight: Tensor, n_trajectories: int, used: "Tape | None" = None) -> "Tape":
-        """A tape at its start, hidden and cell state zero, for a layer with the stacked weights (4 n, n_in + n).
+        """A tape at its start, hidden and cell state zero, for a layer with these `stacked` weights.
 
         A used tape of the same shape is wound back instead: new memory costs as much time as filling it.
         """
         width = weight.shape[0] // 4
         shape = (n_steps, weight.shape[0], n_trajectories)
-        tape = (
-            used
-            if used is not None and used.gates.shape == shape and used.gates.dtype == weight.dtype
-            else cls(
-                signals=weight.new_empty(n_steps + 1, weight.shape[1], n_trajectories),
-                gates=weight.new_empty(n_steps, weight.shape[0], n_trajectories),
+        if used is not None and used.gates.shape == shape and used.gates.dtype == weight.dtype:
+            tape = used
+        else:
+            tape = cls(
+                signals=weight.new_ones(n_steps + 1, weight.shape[1], n_trajectories),
+                gates=weight.new_empty(shape),
                 cells=weight.new_empty(n_steps + 1, width, n_trajectories),
             )
-        )
         tape.signals[0, -width:] = 0
         tape.cells[0] = 0
         return tape
@@ -63,15 +63,15 @@ class Tape:
         """h_0..h_{T-1}, shape (T, n, K)."""
         return self.signals[1:, -self.cells.shape[1] :]
 
-    def step(self, t: int, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    def step(self, t: int, x: Tensor, weight: Tensor) -> Tensor:
         """h_t from x_t (n_in, K) and what the tape holds of step t - 1; shape (n, K).
 
-        (i, f, g, o) = W [x, h] + b, with the logistic function on i, f and o and tanh on g; c' = f c + i g; h' = o tanh(c').
+        (i, f, g, o) = W [x, 1, h], with the logistic function on i, f and o and tanh on g; c' = f c + i g; h' = o tanh(c').
         """
         width = self.cells.shape[1]
         now, after = t % len(self.signals), (t + 1) % len(self.signals)
-        self.signals[now, :-width] = x
-        gates = torch.addmm(bias, weight, self.signals[now], out=self.gates[t % len(self.gates)])
+        self.signals[now, : len(x)] = x
+        gates = torch.mm(weight, self.signals[now], out=self.gates[t % len(self.gates)])
         entry, forget, candidate, exit_ = gates.split(width)
         gates[: 2 * width].sigmoid_()
         candidate.tanh_()
@@ -80,10 +80,10 @@ class Tape:
         return torch.mul(exit_, cell.tanh(), out=self.signals[after, -width:])
 
 
-def stacked(layer: nn.LSTM) -> tuple[Tensor, Tensor]:
-    """The layer's parameters as one matrix on [x, h], shape (4 n, n_in + n), and one bias, shape (4 n, 1)."""
+def stacked(layer: nn.LSTM) -> Tensor:
+    """The layer's parameters as one matrix on [x, 1, h], shape (4 n, n_in + 1 + n)."""
     from_below, from_before, bias_below, bias_before = layer.all_weights[0]
-    return torch.cat([from_below, from_before], dim=1), (bias_below + bias_before)[:, None]
+    return torch.cat([from_below, (bias_below + bias_before)[:, None], from_before], dim=1)
 
 
 class Unroll(torch.autograd.Function):
@@ -93,18 +93,19 @@ class Unroll(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, inputs: Tensor, weight: Tensor, bias: Tensor, tape: Tape | None = None) -> Tensor:
+    def forward(ctx: Any, inputs: Tensor, weight: Tensor, tape: Tape | None = None) -> Tensor:
         """The hidden states, from the tape if there is one."""
         if tape is None:
             tape = Tape.blank(len(inputs), weight, inputs.shape[-1])
             for t, x in enumerate(inputs):
-                tape.step(t, x, weight, bias)
+                tape.step(t, x, weight)
         ctx.tape = tape
+        ctx.n_inputs = inputs.shape[1]
         ctx.save_for_backward(weight)
         return tape.hidden
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, Tensor, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, None]:
         """Backpropagation through time; `d_z` is the gradient of the loss in z. It spends the tape.
 
         Step by step, so that what a step needs stays in the processor's cache, and the gradients in the gates before their
@@ -130,6 +131,5 @@ class Unroll(torch.autograd.Function):
             tanh_backward_into(d_candidate, candidate, grad_input=candidate)
             d_cell = d_before
             d_later = recurrent @ gates[t]
-        d_inputs = weight[:, :-width].T @ gates if ctx.needs_input_grad[0] else None
-        d_weight = torch.bmm(gates, signals[:-1].mT).sum(0)
-        return d_inputs, d_weight, gates.sum((0, 2))[:, None], None
+        d_inputs = weight[:, : ctx.n_inputs].T @ gates if ctx.needs_input_grad[0] else None
+        return d_inputs, torch.bmm(gates, signals[:-1].mT).sum(0), None

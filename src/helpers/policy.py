@@ -94,7 +94,7 @@ class LSTMPolicy(nn.Module):
         previous = torch.cat([torch.zeros_like(u[:1]), u[:-1]])
         signal = self.network_inputs(y[: len(u)], previous, task).mT
         for index, layer in enumerate(self.lstms):
-            hidden = Unroll.apply(signal, *stacked(layer), tapes[index] if tapes else None)
+            hidden = Unroll.apply(signal, stacked(layer), tapes[index] if tapes else None)
             signal = functional.leaky_relu(hidden, self.params.leaky_slope)
         return self.scale((self.output.weight @ signal + self.output.bias[:, None]).mT, task)
 
@@ -143,7 +143,7 @@ class PolicyController:
         n_inputs = self.policy.n_manipulated
         used: Sequence[Tape | None] = self.tapes or [None] * len(self.layers)
         length = n_steps if self.recording else 1
-        tapes = [Tape.blank(length, weight, n_trajectories, old) for (weight, _), old in zip(self.layers, used, strict=True)]
+        tapes = [Tape.blank(length, weight, n_trajectories, old) for weight, old in zip(self.layers, used, strict=True)]
         self.tapes = tapes if self.recording else []
         noise = torch.randn(n_steps, n_trajectories, n_inputs, generator=generator, dtype=like.dtype) if self.exploring else None
         return PolicyMemory(0, tapes, like.new_zeros(n_trajectories, n_inputs), noise)
@@ -151,8 +151,8 @@ class PolicyController:
     def act(self, observation: Tensor, memory: PolicyMemory) -> tuple[Tensor, PolicyMemory]:
         """The policy's command for one sample; the memory is updated in place."""
         signal = self.policy.network_inputs(observation, memory.u_previous, self.task).T
-        for tape, (weight, bias) in zip(memory.tapes, self.layers, strict=True):
-            signal = functional.leaky_relu(tape.step(memory.step, signal, weight, bias), self.policy.params.leaky_slope)
+        for tape, weight in zip(memory.tapes, self.layers, strict=True):
+            signal = functional.leaky_relu(tape.step(memory.step, signal, weight), self.policy.params.leaky_slope)
         mean, std = self.policy.scale(torch.addmm(self.output_bias, self.output_weight, signal).T, self.task)
         command = mean if memory.exploration is None else mean + std * memory.exploration[memory.step]
         memory.u_previous = command.clamp(self.task.input_low, self.task.input_high)

@@ -114,6 +114,8 @@ def main() -> int:
         case = path.parents[1].name
         shutil.copy2(path, partial / "notebooks" / f"{path.stem.removesuffix('_improved')}_{case}.ipynb")
     shutil.copy2(LATEST / "notebooks/05_report.ipynb", partial / "notebooks")
+    if (REFERENCE / "benchmarks").is_dir():  # a run of its own, which stays
+        shutil.copytree(REFERENCE / "benchmarks", partial / "benchmarks")
     shutil.rmtree(REFERENCE, ignore_errors=True)
     partial.rename(REFERENCE)
     readme.write_text(text, encoding="utf-8")

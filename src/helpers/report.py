@@ -23,6 +23,7 @@ from helpers.request import PROJECT
 from helpers.session import parameters_hash
 
 TEMPLATE = PROJECT / "reports/template"
+BENCHMARKS = PROJECT / "reports/reference/benchmarks"  # of make bench, a run of its own
 DEMONSTRATIONS, ONLINE = "demonstrations", "online_improved"
 OFFLINE = {"offline": "improved", "offline_printed": "printed"}  # stage in seeds.csv and the variant behind it
 SCRATCH = "offline_improved"  # of a case that starts from another: the same learning without the transfer
@@ -247,6 +248,8 @@ def write(folder: Path, results: Results) -> Path:
         tabulated["comparison"].to_csv(partial / "comparison.csv", index=False, float_format="%.10g")
         results.seeds.to_csv(partial / "seeds.csv", index=False, float_format="%.10g")
         (partial / "provenance.json").write_text(json.dumps(origin, indent=1) + "\n", encoding="utf-8")
+        if (BENCHMARKS / "scaling.svg").is_file():
+            shutil.copy2(BENCHMARKS / "scaling.svg", partial / "figures/benchmarks.svg")
         text = render(results, tabulated, origin)
         (partial / "report.md").write_text(text, encoding="utf-8")
         typeset(text, partial)
@@ -270,6 +273,8 @@ def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapp
     environment.filters["rounded_table"] = partial(tables.to_markdown, digits=3)
     environment.filters["results_table"] = partial(tables.to_markdown, decimals=tables.RESULT_DECIMALS)
     medians = {stage: results.medians(stage).to_dict() for stage in results.seeds["stage"].unique()}
+    parts = ("summary", "machine")
+    benchmarks = {part: (BENCHMARKS / f"{part}.md").read_text(encoding="utf-8") for part in parts if BENCHMARKS.is_dir()}
     gaps = tabulated["gaps"].set_index("case").to_dict("index")
     return environment.get_template("report.md.jinja").render(
         results=results,
@@ -279,6 +284,7 @@ def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapp
         gaps=gaps,
         cases=results.params,
         published=results.published,
+        benchmarks=benchmarks,
     )
 
 

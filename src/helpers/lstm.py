@@ -118,6 +118,7 @@ class Unroll(torch.autograd.Function):
         recurrent = weight[:, -width:].T.contiguous()
         d_later = torch.zeros_like(cells[0])  # the part of d_h that comes from step t + 1
         d_cell = torch.zeros_like(cells[0])
+        d_weight = torch.zeros_like(weight)
         for t in reversed(range(len(gates))):
             entry, forget, candidate, exit_ = gates[t].split(width)
             squashed = cells[t + 1].tanh()
@@ -131,5 +132,6 @@ class Unroll(torch.autograd.Function):
             tanh_backward_into(d_candidate, candidate, grad_input=candidate)
             d_cell = d_before
             d_later = recurrent @ gates[t]
+            d_weight.addmm_(gates[t], signals[t].T)
         d_inputs = weight[:, : ctx.n_inputs].T @ gates if ctx.needs_input_grad[0] else None
-        return d_inputs, torch.bmm(gates, signals[:-1].mT).sum(0), None
+        return d_inputs, d_weight, None

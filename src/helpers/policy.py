@@ -15,6 +15,30 @@ from helpers.task import ControlTask
 RELU6_TOP = 6.0  # Eq. 3.2.5
 
 
+@dataclass(frozen=True)
+class Scaling:
+    """Deviation variables to and from what the network works with.
+
+    Attributes:
+        centre, gain: of its inputs, shape (n_y + n_u,): the error y_sp - y in its unit, the input as a share of its bounds.
+        shift, factor: of its outputs after ReLU6, shape (n_u + n_u,): means between the bounds, standard deviations.
+    """
+
+    centre: Tensor
+    gain: Tensor
+    shift: Tensor
+    factor: Tensor
+
+    def inputs(self, y: Tensor, u_previous: Tensor) -> Tensor:
+        """What the network sees, shape (..., n_y + n_u)."""
+        return (torch.cat([y, u_previous], dim=-1) - self.centre) * self.gain
+
+    def outputs(self, output: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation, each (..., n_u), from the output layer before its activation."""
+        mean, std = torch.addcmul(self.shift, functional.relu6(output), self.factor).chunk(2, dim=-1)
+        return mean, std
+
+
 class LSTMPolicy(nn.Module):
     """u_t ~ N(mu_t, diag(sigma_t^2)): an LSTM maps the history of normalised errors and inputs to mu and sigma.
 
@@ -62,19 +86,23 @@ class LSTMPolicy(nn.Module):
             self.output.weight[rows] = 0
             self.output.bias[rows] = RELU6_TOP * (params.initial_std - params.std_low) / (params.std_high - params.std_low)
 
+    def scaling(self, task: ControlTask) -> "Scaling":
+        """The units in which the network sees and answers for a task."""
+        params, span = self.params, task.input_high - task.input_low
+        return Scaling(
+            centre=torch.cat([task.set_point, (task.input_high + task.input_low) / 2]),
+            gain=torch.cat([-1 / self.error_unit, 2 / span]),
+            shift=torch.cat([task.input_low, params.std_low * span]),
+            factor=torch.cat([span, (params.std_high - params.std_low) * span]) / RELU6_TOP,
+        )
+
     def network_inputs(self, y: Tensor, u_previous: Tensor, task: ControlTask) -> Tensor:
         """What the network sees, shape (..., n_y + n_u), from observations and the inputs applied one sample before."""
-        error = (task.set_point - y) / self.error_unit
-        middle, half = (task.input_high + task.input_low) / 2, (task.input_high - task.input_low) / 2
-        return torch.cat([error, (u_previous - middle) / half], dim=-1)
+        return self.scaling(task).inputs(y, u_previous)
 
     def scale(self, output: Tensor, task: ControlTask) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the inputs, each (..., n_u), from the output layer before its activation."""
-        fraction = functional.relu6(output) / RELU6_TOP
-        mean, deviation = fraction.split(self.n_manipulated, dim=-1)
-        span = task.input_high - task.input_low
-        std = (self.params.std_low + (self.params.std_high - self.params.std_low) * deviation) * span
-        return task.input_low + span * mean, std
+        return self.scaling(task).outputs(output)
 
     def forward(self, y: Tensor, u: Tensor, task: ControlTask) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of u_0..u_{T-1} along recorded trajectories, each (T, K, n_u).
@@ -136,6 +164,7 @@ class PolicyController:
             self.layers = [stacked(layer) for layer in policy.lstms]
             self.output_weight, self.output_bias = policy.output.weight.clone(), policy.output.bias[:, None].clone()
         self.tapes = list(used)
+        self.scaling = policy.scaling(task)
 
     def start(self, n_trajectories: int, n_steps: int, generator: torch.Generator) -> PolicyMemory:
         """Zero hidden states, the input at u* = 0, and all exploration noise drawn at once."""
@@ -150,10 +179,10 @@ class PolicyController:
 
     def act(self, observation: Tensor, memory: PolicyMemory) -> tuple[Tensor, PolicyMemory]:
         """The policy's command for one sample; the memory is updated in place."""
-        signal = self.policy.network_inputs(observation, memory.u_previous, self.task).T
+        signal = self.scaling.inputs(observation, memory.u_previous).T
         for tape, weight in zip(memory.tapes, self.layers, strict=True):
             signal = functional.leaky_relu(tape.step(memory.step, signal, weight), self.policy.params.leaky_slope)
-        mean, std = self.policy.scale(torch.addmm(self.output_bias, self.output_weight, signal).T, self.task)
+        mean, std = self.scaling.outputs(torch.addmm(self.output_bias, self.output_weight, signal).T)
         command = mean if memory.exploration is None else mean + std * memory.exploration[memory.step]
         memory.u_previous = command.clamp(self.task.input_low, self.task.input_high)
         memory.step += 1

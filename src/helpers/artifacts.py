@@ -19,7 +19,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
-from helpers.params import LearningParams
+from helpers.params import InputError, LearningParams
 from helpers.policy import LSTMPolicy
 from helpers.task import ControlTask
 from helpers.trajectories import Trajectories
@@ -29,12 +29,8 @@ PACKAGES = ("torch", "numpy", "pandas", "matplotlib", "seaborn", "papermill", "s
 FLOATS = "%.17g"  # enough digits to read back the very same number
 
 
-class ArtifactError(ValueError):
+class ArtifactError(InputError):
     """A result on disk is missing, damaged or of another shape; one sentence names it and what to do."""
-
-    def _render_traceback_(self) -> list[str]:
-        """What IPython shows: the sentence alone."""
-        return [f"{type(self).__name__}: {self}"]
 
 
 @dataclass(frozen=True)

@@ -19,12 +19,16 @@ LEAF_KEYS = ("value", "unit", "source", "status")
 STATUSES = ("reported", "inferred", "assumed")
 
 
-class ParameterError(ValueError):
-    """A parameter file is unusable; the message is one sentence that names the file and the key."""
+class InputError(ValueError):
+    """What a user gave cannot be used; the message is one sentence that says all there is to say."""
 
     def _render_traceback_(self) -> list[str]:
         """What IPython shows: the sentence alone."""
         return [f"{type(self).__name__}: {self}"]
+
+
+class ParameterError(InputError):
+    """A parameter file is unusable; the message names the file and the key."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from helpers.params import Params, load
+from helpers.params import InputError, Params, load
 
 PROJECT = Path(__file__).resolve().parents[2]
 NOTEBOOK_PARAMETERS = {
@@ -21,12 +21,8 @@ NOTEBOOK_PARAMETERS = {
 }
 
 
-class SessionError(ValueError):
+class SessionError(InputError):
     """A notebook was given a parameter it does not have, or a value it cannot use."""
-
-    def _render_traceback_(self) -> list[str]:
-        """What IPython shows: the sentence alone."""
-        return [f"{type(self).__name__}: {self}"]
 
 
 def parameter_names(notebook: str) -> list[str]:

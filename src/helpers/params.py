@@ -350,6 +350,12 @@ class PublishedCase(Record):
         _same_length(len(self.expert), self, "policy", "alpha")
         return self
 
+    @property
+    def feature_gap(self) -> float:
+        """The paper's own feature gap: the mean of |v_pi - v_E| / |v_E| over its two printed rows."""
+        pairs = list(zip(self.policy, self.expert, strict=True))
+        return sum(abs(policy - expert) / abs(expert) for policy, expert in pairs) / len(pairs)
+
 
 @dataclass(frozen=True)
 class Params:

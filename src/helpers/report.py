@@ -90,6 +90,7 @@ def collect(root: Path, params_root: Path, scale: str, cases: tuple[int, ...], n
         ArtifactError: if a stage is missing, damaged or was made with other parameters than the files now hold.
     """
     params = {case: load(params_root, case) for case in cases}
+    published = load_published(params_root)
     stages: dict[tuple[int, int, str], Stage] = {}
     frames = []
     for case, record in params.items():
@@ -110,7 +111,7 @@ def collect(root: Path, params_root: Path, scale: str, cases: tuple[int, ...], n
                 scores = stage.table("scores.csv", ("stage", "metric", "value"))
                 frames.append(scores.assign(case=case, seed=seed, stage=scores["stage"].map(names)))
     seeds = pd.concat(frames, ignore_index=True)[["case", "seed", "stage", "metric", "value"]]
-    return Results(scale, params, {case: load_published(params_root)[case] for case in cases}, stages, seeds)
+    return Results(scale, params, {case: published[case] for case in cases}, stages, seeds)
 
 
 def draw(results: Results) -> dict[str, Figure]:
@@ -139,7 +140,7 @@ def draw(results: Results) -> dict[str, Figure]:
         drawn[f"learning_curves_case_{case}"] = figures.learning_curves(
             results.table(case, offline, "history.csv"),
             marks={chosen: "policy taken from here"},
-            gap_levels={"the paper's own gap": published_gap(results.published[case])},
+            gap_levels={"the paper's own gap": results.published[case].feature_gap},
         )
         history = results.table(case, ONLINE, "history.csv")
         drawn[f"online_curves_case_{case}"] = figures.learning_curves(history, marks=_rounds(params.case.online, len(history)))
@@ -147,12 +148,6 @@ def draw(results: Results) -> dict[str, Figure]:
         if name in drawn:
             drawn[f"figure_{number}"] = drawn.pop(name)
     return drawn
-
-
-def published_gap(published: PublishedCase) -> float:
-    """The paper's own feature gap: the mean of |v_pi - v_E| / |v_E| over its two printed rows."""
-    pairs = list(zip(published.policy, published.expert, strict=True))
-    return sum(abs(policy - expert) / abs(expert) for policy, expert in pairs) / len(pairs)
 
 
 def _rounds(online: OnlineParams, n_epochs: int) -> dict[int, str]:

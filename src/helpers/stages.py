@@ -159,8 +159,7 @@ def outcome(session: Session, scores: Mapping[str, float]) -> pd.DataFrame:
     """The feature gap, the paper's own, and what learning cost."""
     rows = {"feature gap, %": 100 * scores["feature_gap"]}
     if session.published is not None:
-        printed = torch.tensor([session.published.policy, session.published.expert])
-        rows["feature gap of the paper, %"] = 100 * feature_gap(*printed)
+        rows["feature gap of the paper, %"] = 100 * session.published.feature_gap
     rows |= {name.replace("_", " "): scores[name] for name in ("chosen_epoch", "epochs", "episodes", "gradient_steps")}
     return pd.Series(rows).to_frame("value")
 

@@ -1,6 +1,7 @@
 # `make help` lists what can be asked for. The plain commands behind each target stand in README.
 PYTHON ?= python3
 SEEDS ?= 1
+SCALE ?= paper
 CORES ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
@@ -11,11 +12,11 @@ export OPENBLAS_NUM_THREADS := 1
 export MPLBACKEND := agg
 SNAKEMAKE = $(BIN)/python -m snakemake --profile profiles/local --cores $(CORES)
 
-.PHONY: help setup reports smoke test lab bench publish notebooks clean
+.PHONY: help setup reports evidence smoke test lab bench publish notebooks clean
 
 help:  ## show this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-10s %s\n", $$1, $$2}'
-	@echo "Settings: SEEDS=20 CORES=2 PYTHON=python3.12"
+	@echo "Settings: SEEDS=20 CORES=2 PYTHON=python3.12, and for evidence SCALE=smoke"
 
 setup: $(VENV)/installed  ## create .venv and install environment.txt
 
@@ -28,6 +29,10 @@ $(VENV)/installed: environment.txt pyproject.toml
 reports: setup  ## run everything at paper scale and write reports/latest/report.html
 	$(SNAKEMAKE) --config seeds=$(SEEDS) scale=paper
 	@echo "The report: $(CURDIR)/reports/latest/report.html"
+
+evidence: SEEDS = 20
+evidence: setup  ## twenty seeds of it, the claims, the trials and the inferred settings; an hour and a half, resumable
+	$(SNAKEMAKE) --config seeds=$(SEEDS) scale=$(SCALE) evidence=1 $(if $(filter smoke,$(SCALE)),reports=results/smoke/report)
 
 smoke: setup  ## the same in seconds, with few epochs; the report goes to results/smoke/report/
 	$(SNAKEMAKE) --config seeds=1 scale=smoke reports=results/smoke/report

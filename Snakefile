@@ -1,15 +1,22 @@
 # The order of the stages for each case and seed. Every stage is one notebook, executed by helpers.run.
-# Settings (snakemake --config name=value): seeds (how many), scale (smoke or paper), variants, results, reports.
+# Settings (snakemake --config name=value): seeds (how many), scale (smoke or paper), results, reports (folders), and
+# evidence=1 for the runs beyond the paper's own: the claims, the trials of offline learning and the inferred settings.
 import shlex
 import sys
 from pathlib import Path
 
+from helpers.params import load_trials
+from helpers.sources import modules_behind, notebook_path
+
 ROOT = Path(workflow.basedir)
 SCALE = config.get("scale", "paper")
 SEEDS = range(int(config.get("seeds", 1)))
+EVIDENCE = bool(int(config.get("evidence", 0)))
 RESULTS = config.get("results", "results")
 REPORTS = config.get("reports", "reports/latest")
 VARIANTS = ["improved", "printed"]
+TRIALS = sorted(load_trials(ROOT / "params"))
+TRIAL_SEEDS = SEEDS[:5]
 CASES = [1, 2, 3]
 CASE = f"{RESULTS}/{SCALE}/seed_{{seed}}/case_{{case}}"
 LOG = f"{RESULTS}/{SCALE}/seed_{{seed}}/case_{{case}}/notebooks"
@@ -17,16 +24,17 @@ RUN = f"{shlex.quote(sys.executable)} -m helpers.run"
 FOLDER = shlex.quote(str(Path(RESULTS).resolve()))
 ROOTS = f"-p scale {SCALE} -p input_root {FOLDER} -p output_root {FOLDER}"
 
-# What a stage's result depends on beside earlier stages: its notebook, its parameter files and the modules behind it.
-UNRELATED = ("tables", "report", "run", "publish", "refresh")
-MODULES = [str(path) for path in sorted((ROOT / "src/helpers").glob("*.py")) if path.stem not in UNRELATED]
 PARAMS = [str(ROOT / "params" / f"{name}.yaml") for name in ("process", "demonstrators", "features", "learning")]
 
 
-def sources(notebook):
+def sources(notebook, *params):
+    """What a result depends on beside earlier stages: its notebook, its parameter files and the modules behind it."""
+    code = [str(path) for path in (notebook_path(notebook), *modules_behind(notebook))]
+
     def inputs(wildcards):
-        case = getattr(wildcards, "case", 3)
-        return [str(ROOT / "notebooks" / f"{notebook}.ipynb"), str(ROOT / f"params/case_{case}.yaml"), *PARAMS, *MODULES]
+        case, variant = getattr(wildcards, "case", 3), getattr(wildcards, "variant", "")
+        named = [*params, f"case_{case}", *(["trials"] if variant in TRIALS else [])]
+        return [*code, *PARAMS, *(str(ROOT / f"params/{name}.yaml") for name in named)]
 
     return inputs
 
@@ -34,7 +42,7 @@ def sources(notebook):
 wildcard_constraints:
     seed=r"\d+",
     case=r"\d+",
-    variant="|".join(VARIANTS),
+    variant="|".join([*VARIANTS, *TRIALS]),
 
 
 localrules:
@@ -98,6 +106,32 @@ rule transfer:
         f"{RUN} 04_knowledge_transfer {{log:q}} -p case 3 -p seed {{wildcards.seed}} -p variant {{wildcards.variant}} {ROOTS}"
 
 
+rule claims:
+    input:
+        sources("08_claims", "experiments"),
+        demonstrations=f"{CASE}/demonstrations/record.json",
+        offline=lambda wildcards: f"{CASE}/{'transfer' if wildcards.case == '3' else 'offline'}_improved/record.json",
+        online=f"{CASE}/online_improved/record.json",
+    output:
+        f"{CASE}/experiments/record.json",
+    log:
+        f"{LOG}/08_claims.ipynb",
+    priority: -1
+    shell:
+        f"{RUN} 08_claims {{log:q}} -p case {{wildcards.case}} -p seed {{wildcards.seed}} {ROOTS}"
+
+
+def evidence():
+    """The runs beyond the paper's own."""
+    folder = f"{RESULTS}/{SCALE}"
+    stages = [f"{folder}/seed_{seed}/case_{case}/experiments/record.json" for seed in SEEDS for case in CASES]
+    for seed in TRIAL_SEEDS:
+        for trial in TRIALS:
+            stages += [f"{folder}/seed_{seed}/case_{case}/offline_{trial}/record.json" for case in (1, 2)]
+            stages += [f"{folder}/seed_{seed}/case_3/transfer_{trial}/record.json"]
+    return stages
+
+
 def finished(wildcards):
     """Every result that the report reads, for every seed."""
     stages = []
@@ -108,14 +142,12 @@ def finished(wildcards):
         stages += [f"{folder}/case_3/offline_improved/record.json"]
         stages += [f"{folder}/case_3/transfer_{variant}/record.json" for variant in VARIANTS]
         stages += [f"{folder}/case_{case}/online_improved/record.json" for case in CASES]
-    return stages
+    return stages + (evidence() if EVIDENCE else [])
 
 
 rule report:
     input:
-        sources("05_report"),
-        published=str(ROOT / "params/published.yaml"),
-        modules=[str(ROOT / f"src/helpers/{name}.py") for name in ("tables", "report")],
+        sources("05_report", "published", "claims", "trials"),
         template=[str(path) for path in sorted((ROOT / "reports/template").iterdir())],
         stages=finished,
     output:

@@ -17,6 +17,7 @@ from helpers.evaluation import (
     overshoot,
     relative_gap,
     rise_time,
+    scores,
 )
 from helpers.params import load_published
 from helpers.randomness import stream
@@ -65,6 +66,16 @@ def test_expert_rows_of_the_published_tables(study, root, case):
     example, published = study(case), torch.tensor(load_published(root)[case].expert, dtype=F64)
     found = expected_features(example.process, example.pid, example.features, 20_000, stream(0, "expert", case))
     assert feature_gap(found.mean, published) <= 0.03
+
+
+def test_scores_hold_mean_and_deviation_of_every_feature(study):
+    case = study()
+    batch = rollout(case.process, case.pid, case.task, 40, stream(0, "scores"))
+    found = scores(batch, case.features, 30.0, ("C_A", "T"), ("C_A0", "T_E"))
+    v = case.features.trajectory(batch).numpy()
+    names = ("C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III")
+    np.testing.assert_allclose([found[f"v:{name}"] for name in names], v.mean(0), rtol=1e-12)
+    np.testing.assert_allclose([found[f"v:{name}:std"] for name in names], v.std(0, ddof=1), rtol=1e-12)
 
 
 def test_relative_gap_is_counted_in_units_of_the_experts_size():

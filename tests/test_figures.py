@@ -172,13 +172,15 @@ def test_control_figure_names_panels_variables_units_and_all_that_is_drawn(n_loo
         assert part in shown
 
 
-@pytest.mark.parametrize("kind", ["control", "tracking", "curves", "online", "mdp", "framework", "network"])
+@pytest.mark.parametrize("kind", ["control", "tracking", "curves", "online", "seeds", "budget", "mdp", "framework", "network"])
 def test_nothing_is_cut_off_and_no_panels_overlap(kind: str) -> None:
     figure = {
         "control": lambda: draw(3),
         "tracking": lambda: figures.tracking_figure(response(), OUTPUTS[:2], SET_POINTS[:2], WORDS),
         "curves": lambda: figures.learning_curves(history(), {40: "policy kept"}, {"PID": 3.0}, {"paper": 0.1}),
         "online": lambda: figures.learning_curves(history()[["epochs", "mean_return"]], {10: "second round"}, {"PID": 3.0}),
+        "seeds": lambda: draw(2, several(response(), ["mean"])),
+        "budget": budget_figure,
         "mdp": drawings.mdp_figure,
         "framework": drawings.framework_figure,
         "network": lambda: drawings.network_figure((20, 20), 2, 2, 0.01),
@@ -220,6 +222,84 @@ def test_a_response_without_a_variable_is_refused() -> None:
     table = response()
     with pytest.raises(ValueError, match="controller 'agent' and variable 'T_E'"):
         draw(2, table.query("controller == 'expert' or variable != 'T_E'"))
+
+
+def several(table: pd.DataFrame, columns: list[str], n_seeds: int = 4) -> pd.DataFrame:
+    """The table for several seeds, its columns shifted by 0, 1, 2 and 10."""
+    shifts = (0.0, 1.0, 2.0, 10.0)[:n_seeds]
+    frames = [table.assign(seed=seed, **{name: table[name] + shift for name in columns}) for seed, shift in enumerate(shifts)]
+    return pd.concat(frames, ignore_index=True)
+
+
+def test_several_seeds_are_thin_lines_about_their_median() -> None:
+    table = response()
+    figure = draw(2, several(table, ["mean", "std"]))
+    expected = rows_of(table, "agent", "T")
+    panel = next(axes for axes in figure.axes if axes.get_label() == "B T")
+    (line,) = [line for line in panel.lines if line.get_label() == "controlled, agent"]
+    np.testing.assert_allclose(curve(line)[:, 1], expected["mean"] + 1.5)
+    thin = {label: paths for label, paths in ((c.get_label(), c.get_paths()) for c in panel.collections) if label == figures.SINGLE}
+    assert len(thin[figures.SINGLE]) == 4
+    summary = figures.drawn_summary(figure).query("panel == 'B T' and artist == @figures.SINGLE")
+    assert len(summary) == 8  # of expert and agent
+    assert np.isin(np.round(expected["mean"].max() + np.array([0.0, 1, 2, 10]), 9), summary["maximum"].round(9)).all()
+    band = next(c for c in panel.collections if c.get_label() == f"controlled, agent: {figures.BAND}")
+    edge = expected["mean"] + 1.5 + expected["std"] + 1.5
+    assert np.isin(edge.round(9), np.asarray(band.get_paths()[0].vertices)[:, 1].round(9)).all()
+    shown = texts(figure)
+    assert "medians over 4 seeds" in shown
+    assert "the mean of each seed" in shown
+
+
+def test_an_input_of_each_seed_is_held_until_the_next_sample() -> None:
+    figure = draw(2, several(response(), ["mean"], 2))
+    panel = next(axes for axes in figure.axes if axes.get_label() == "T_E")
+    thin = next(collection for collection in panel.collections if collection.get_label() == figures.SINGLE)
+    points = np.asarray(thin.get_paths()[0].vertices)
+    assert points[-1, 0] == N_STEPS
+    assert ((np.diff(points[:, 0]) == 0) | (np.diff(points[:, 1]) == 0)).all()
+
+
+def test_learning_curves_of_several_seeds_show_each_and_their_median() -> None:
+    table = history()
+    figure = figures.learning_curves(several(table, ["mean_return", "alpha:T-I"]), {40: "policy kept"})
+    returns, _, weights = figure.axes
+    np.testing.assert_allclose(curve(returns.lines[0])[:, 1], table["mean_return"] + 1.5)
+    np.testing.assert_allclose(curve(weights.lines[1])[:, 1], table["alpha:T-I"] + 1.5)
+    assert [len(axes.collections) for axes in figure.axes] == [1, 1, 6]
+    assert all(len(collection.get_paths()) == 4 for axes in figure.axes for collection in axes.collections)
+    assert "each of 4 seeds" in texts(figure)
+
+
+def budget() -> pd.DataFrame:
+    rows = [(s, c, n, c + s + n / 500) for s in range(3) for c in (1, 2) for n in (500, 20, 100)]
+    return pd.DataFrame(rows, columns=["seed", "case", "episodes_per_epoch", "objective"])
+
+
+def budget_figure() -> Figure:
+    levels = {"PID": 1.5, "offline policy": 1.2, "minimum variance on y": 5.0}
+    return figures.budget_figure(budget(), {1: levels, 2: levels}, {1: "Case Study I", 2: "Case Study II"})
+
+
+def test_the_budget_curve_shows_median_seeds_and_references() -> None:
+    figure = budget_figure()
+    first, second = figure.axes
+    for axes, case in ((first, 1), (second, 2)):
+        assert curve(axes.lines[0]).tolist() == pytest.approx(np.array([[n, case + 1 + n / 500] for n in (20, 100, 500)]))
+        assert [line.get_ydata()[0] for line in axes.lines[1:]] == [1.5, 1.2, 5.0]
+        assert len(axes.collections[0].get_paths()) == 3
+        assert axes.get_xscale() == "log"
+    shown = texts(figure)
+    for part in (
+        "Case Study II",
+        "plant episodes per epoch",
+        "PID",
+        "offline policy",
+        "minimum variance",
+        "each of 3 seeds",
+        "500",
+    ):
+        assert part in shown
 
 
 def test_learning_curves_draw_return_gap_and_every_weight() -> None:

@@ -14,7 +14,7 @@ from xml.etree import ElementTree as ET
 import nbformat
 import pytest
 
-from helpers.request import PROJECT
+from helpers.sources import PROJECT
 
 NOTEBOOKS = {path.stem: path for path in sorted((PROJECT / "notebooks").glob("*.ipynb"))}
 LONGEST = 80  # lines of code, without blank lines and comments

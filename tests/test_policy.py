@@ -5,7 +5,8 @@ import pytest
 import torch
 from scipy.stats import norm
 
-from helpers.policy import LSTMPolicy, PolicyController
+from helpers.params import ExplorationParams
+from helpers.policy import LSTMPolicy, PolicyController, entropy
 from helpers.randomness import stream
 from helpers.rollout import rollout
 
@@ -131,6 +132,13 @@ def test_log_probability_is_that_of_independent_normal_inputs(study):
     assert found.shape == (50, 7)
 
 
+def test_entropy_is_that_of_inputs_measured_by_their_range(study):
+    task = study().task
+    std = torch.rand(4, 3, 2, generator=stream(0), dtype=F64) + 0.1
+    expected = norm.entropy(scale=std.numpy() / (task.input_high - task.input_low).numpy()).sum(-1)
+    np.testing.assert_allclose(entropy(std, task), expected, rtol=1e-12)
+
+
 @pytest.mark.equation("3.1.6")
 @pytest.mark.equation("3.2.3")
 def test_only_the_policy_contributes_to_the_gradient_of_a_trajectorys_probability(study):
@@ -205,6 +213,21 @@ def test_reset_exploration_restores_the_spread_and_keeps_the_mean(study):
     assert torch.equal(before[0], after[0])
     assert not torch.allclose(before[1], after[1])
     torch.testing.assert_close(after[1], (policy.params.initial_std * span).expand_as(after[1]), rtol=1e-12, atol=0)
+
+
+def test_reset_exploration_takes_new_limits_and_keeps_the_mean(study):
+    case = study()
+    policy = stirred(case.policy())
+    batch = episodes(case, policy)
+    before = policy(batch.y, batch.u, case.task)
+    policy.reset_exploration(ExplorationParams.model_construct(std_low=0.1, std_high=0.9, initial_std=0.3))
+    mean, std = policy(batch.y, batch.u, case.task)
+    span = case.task.input_high - case.task.input_low
+    assert torch.equal(before[0], mean)
+    torch.testing.assert_close(std, (0.3 * span).expand_as(std), rtol=1e-12, atol=0)
+    with torch.no_grad():
+        policy.output.bias[policy.n_manipulated :] = 99.0
+    torch.testing.assert_close(policy(batch.y, batch.u, case.task)[1], (0.9 * span).expand_as(std), rtol=1e-12, atol=0)
 
 
 def test_the_policy_sees_the_past_and_nothing_later(study):

@@ -2,14 +2,13 @@
 
 import json
 
-import pandas as pd
 import pytest
 
 from helpers import publish
 from helpers.publish import PublishError, check
 
 REVISION = "0123abcd" * 5
-GOOD = {"scale": "paper", "revision": REVISION, "revisions_of_stages": [REVISION], "seeds": [0, 1]}
+GOOD = {"scale": "paper", "revision": REVISION, "revisions_of_stages": [REVISION], "seeds": [0, 1], "notebooks_changed_since": []}
 OTHER = "f" * 40
 
 
@@ -31,7 +30,7 @@ REFUSED = {
     ),
     "one stage of changed code": ({"revisions_of_stages": [REVISION, REVISION + "+changes"]}, None, REVISION, "+changes"),
     "a report of another commit": ({"revision": OTHER}, None, REVISION, OTHER),
-    "stages of another commit": ({"revisions_of_stages": [OTHER]}, None, REVISION, OTHER),
+    "stages of other code": ({"notebooks_changed_since": ["02_offline_irl"]}, None, REVISION, "02_offline_irl"),
     "another commit now": ({}, None, OTHER, OTHER),
     "no checkout": ({"revision": "unknown", "revisions_of_stages": ["unknown"]}, None, "unknown", "unknown"),
 }
@@ -50,14 +49,11 @@ def test_other_runs_are_refused_in_one_sentence(changes, reference, revision, sa
 README = "# Title\n<!-- glance: a -->\nold\n<!-- /glance -->\nmiddle\n<!-- time: b -->\n<!-- /time -->\nend\n"
 
 
-def comparison():
-    """Case 1 alone: the expert 1 % off; policies 10 % (paper) and 20 % (ours) from their experts."""
-    rows = [
-        {"case": 1, "row": row, "feature": feature, "published": scale * published, "reproduced": scale * reproduced, "n_seeds": 1}
-        for row, published, reproduced in (("expert", 1.0, 1.01), ("policy", 1.1, 0.808), ("alpha", 0.5, 0.4))
-        for feature, scale in (("C_A-I", 20.0), ("T-III", -22.0))
-    ]
-    return pd.DataFrame(rows)
+GAPS = """\
+case,n_seeds,feature_gap,feature_gap_low,feature_gap_high,published_gap,expert_error,expert_error_low,expert_error_high,online_share
+1,20,0.2,0.15,0.31,0.1,0.01,0.009,0.012,0.951
+2,20,0.03,0.02,0.04,0.137,0.02,0.02,0.02,
+"""
 
 
 @pytest.fixture
@@ -70,8 +66,8 @@ def project(monkeypatch, tmp_path):
         latest / "figures/figure_3.png": "picture",
         latest / "tables/table_2.csv": "a,b",
         latest / "tables/time.csv": "case,stage,seconds\n1,demonstrations,2.4\n2,demonstrations,3.6\n1,offline_improved,20.2\n",
-        latest / "tables/gaps.csv": "case,n_seeds,feature_gap,published_gap,expert_error\n1,1,0.2,0.1,0.01\n",
-        latest / "comparison.csv": comparison().to_csv(index=False),
+        latest / "tables/gaps.csv": GAPS,
+        latest / "comparison.csv": "a,b",
         latest / "seeds.csv": "case,seed,stage,metric,value\n1,0,offline,feature_gap,0.2\n",
         latest / "provenance.json": json.dumps(GOOD),
         latest / "notebooks/05_report.ipynb": "05",
@@ -111,8 +107,10 @@ def test_publishing_copies_the_report_and_the_executed_notebooks_of_the_first_se
 def test_publishing_writes_the_numbers_into_readme(project):
     assert publish.main() == 0
     lines = (project / "README.md").read_text(encoding="utf-8").splitlines()
-    (row,) = [line for line in lines if line.startswith("| I ")]
-    assert [cell.strip() for cell in row.strip("|").split("|")] == ["I", "1.0 %", "10.0 %", "20.0 %"]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith(("| I ", "| II "))]
+    assert rows[0] == ["I", "1.0 % [0.9, 1.2]", "10.0 %", "20.0 % [15.0, 31.0]", "95.1 %"]
+    assert rows[1] == ["II", "2.0 %", "13.7 %", "3.0 % [2.0, 4.0]", "–"]
+    assert "(ours: medians and 95 % bootstrap intervals of the median over 20 seeds)" in lines
     assert any("offline_improved" in line and " 20 " in line for line in lines)
     kept = [line for line in lines if line in README.splitlines()]
     assert kept == ["# Title", "<!-- glance: a -->", "<!-- /glance -->", "middle", "<!-- time: b -->", "<!-- /time -->", "end"]

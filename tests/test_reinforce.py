@@ -1,5 +1,6 @@
 """Algorithm 1: returns, baselines, the policy gradient against exact integration, and the learner's book-keeping."""
 
+import copy
 from itertools import pairwise
 
 import numpy as np
@@ -260,12 +261,39 @@ def test_the_first_step_climbs_the_gradient(study, settings):
         )
 
 
-@pytest.mark.parametrize("minibatches", [1, 4])
-def test_epochs_episodes_and_gradient_steps_are_counted(study, settings, minibatches):
+@pytest.mark.parametrize(("passes", "minibatches"), [(1, 1), (1, 4), (3, 2)])
+def test_epochs_episodes_and_gradient_steps_are_counted(study, settings, passes, minibatches):
     case = study()
-    learner = case.learner(case.policy(), 8, 3, settings(minibatches=minibatches))
+    learner = case.learner(case.policy(), 8, 3, settings(passes=passes, minibatches=minibatches))
     records = reinforce(learner, closeness_reward(case), 3)
-    assert (len(records), learner.epochs, learner.episodes, learner.gradient_steps) == (3, 3, 24, 3 * minibatches)
+    assert (len(records), learner.epochs, learner.episodes, learner.gradient_steps) == (3, 3, 24, 3 * passes * minibatches)
+
+
+def test_a_second_pass_starts_from_the_policy_that_the_first_one_left(study, settings):
+    """Two passes over one batch, against two clipped steps written out with plain autograd."""
+    case = study()
+    policy = case.policy()
+    reference, optimiser = copy.deepcopy(policy), None
+    reward, task = closeness_reward(case), case.task
+    params = settings(passes=2, minibatches=1, learning_rate_start=1e-2, credit="whole_return", averaging=0.0, ratio_clip=0.05)
+    learner = case.learner(policy, 12, 2, params)
+    batch = rollout(case.process, PolicyController(reference, task, True), task, 12, stream(0, "learner"))
+    advantage = whole_return_advantage(reward(batch), 0.99)
+    advantage = advantage / advantage.std()
+    optimiser = torch.optim.Adam(reference.parameters(), lr=1e-2)
+    drawn = None
+    for _ in range(2):
+        mean, std = reference(batch.y, batch.u, task)
+        log_probability = torch.distributions.Normal(mean, std).log_prob(batch.command).sum(-1)
+        drawn = log_probability.detach() if drawn is None else drawn
+        ratio = (log_probability - drawn).exp()
+        gain = torch.minimum(ratio * advantage, ratio.clamp(0.95, 1.05) * advantage).sum(0).mean()
+        optimiser.zero_grad()
+        (-gain).backward()
+        optimiser.step()
+    learner.epoch(reward)
+    for value, expected in zip(learner.policy.parameters(), reference.parameters(), strict=True):
+        torch.testing.assert_close(value.detach(), expected.detach(), rtol=1e-6, atol=1e-7)
 
 
 def test_the_record_of_an_epoch_is_that_of_its_batch(study, settings):
@@ -330,6 +358,26 @@ def test_a_few_epochs_raise_the_return_on_an_easy_task(study, variant):
         update={"learning_rate_start": 1e-2, "learning_rate_end": 1e-2, "patience": 0}
     )
     learner = case.learner(case.policy(), 100, 25, params)
+    returns = [record.mean_return for record in reinforce(learner, closeness_reward(case, 1.0), 25)]
+    assert np.mean(returns[-3:]) > returns[0] + 20
+
+
+@pytest.mark.parametrize("minibatches", [1, 2])
+def test_an_entropy_bonus_keeps_exploration_up(study, settings, minibatches):
+    case = study(1, torch.float32)
+
+    def spread(bonus):
+        params = settings(credit="reward_to_go", entropy=bonus, minibatches=minibatches, learning_rate_start=3e-2)
+        return reinforce(case.learner(case.policy(), 20, 8, params), closeness_reward(case), 8)[-1].policy_std
+
+    assert spread(1.0) > spread(0.0) + 0.003
+
+
+def test_the_natural_gradient_raises_the_return_on_an_easy_task(study, settings):
+    """As the test of the variants above, in as many steps: the policy's distribution moves by the trust region in each."""
+    case = study(1, torch.float32)
+    changes = {"credit": "reward_to_go", "trust_region": 0.1, "learning_rate_start": 1.0, "learning_rate_end": 1.0}
+    learner = case.learner(case.policy(), 100, 25, settings(**changes))
     returns = [record.mean_return for record in reinforce(learner, closeness_reward(case, 1.0), 25)]
     assert np.mean(returns[-3:]) > returns[0] + 20
 

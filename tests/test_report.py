@@ -9,9 +9,9 @@ from itertools import product
 import pandas as pd
 import pytest
 
-from helpers import report
-from helpers.artifacts import ArtifactError
-from helpers.request import PROJECT
+from helpers import collection, report, scorecard
+from helpers.artifacts import ArtifactError, save_stage
+from helpers.sources import PROJECT
 
 CASES = (1, 2, 3)
 TABLE_OF_CASE = {1: 2, 2: 3, 3: 4}
@@ -23,7 +23,7 @@ RESOURCES = {"src", "data", "srcset", "poster", "background"}
 
 
 def collect(root=INPUTS, params_root=PARAMS, n_seeds=1):
-    return report.collect(root, params_root, "smoke", CASES, n_seeds)
+    return collection.collect(root, params_root, "smoke", CASES, n_seeds)
 
 
 @pytest.fixture(scope="module")
@@ -116,6 +116,18 @@ def test_every_figure_has_a_caption_and_alternative_text(page):
     assert all(f"Figure {number}. " in text for number in (3, 4, 5, 6))
 
 
+def test_the_report_opens_with_one_page_to_stop_after(page):
+    """What was reproduced, what was not and what nobody could know stand before everything else."""
+    headings = [tag for tag, _, _ in page.elements if tag in ("h1", "h2")]
+    assert headings[:5] == ["h1", "h1", "h2", "h2", "h2"]
+    text = " ".join("".join(page.text).split())
+    places = [text.index(words) for words in ("What was reproduced", "What was not", "What nobody could know", "Student’s")]
+    assert places == sorted(places)
+    first_page = text[: places[-1]]
+    for part in ("one seed", "Feature gap, paper", "sampling time", "Inferred by us", "Chosen by us", "cannot tell"):
+        assert part in first_page
+
+
 def test_tables_are_tables_with_headers(page):
     text = " ".join("".join(page.text).split())
     assert all(f"Table {number}. " in text for number in (1, 2, 3, 4))
@@ -158,7 +170,8 @@ def test_every_figure_and_table_of_the_paper_has_its_files(written):
         assert (written / "tables" / f"table_{number}.{ending}").stat().st_size > 100
     for number in (2, 3, 4):
         table = pd.read_csv(written / f"tables/table_{number}.csv")
-        assert table["source"].tolist() == ["published", "reproduced"] * 3
+        sources = ["published", "reproduced", "interval of median", "interval of one run", "verdict"]
+        assert table["source"].tolist() == sources * 3
         assert table[FEATURES].notna().all(axis=None)
 
 
@@ -171,12 +184,15 @@ def test_what_an_older_report_left_is_replaced_and_other_files_stay(written):
 
 def test_comparison_has_one_row_for_each_published_number(written):
     table = pd.read_csv(written / "comparison.csv")
-    assert list(table) == ["table", "case", "row", "feature", "published", "reproduced", "n_seeds"]
+    assert list(table) == scorecard.COLUMNS
     keys = [(TABLE_OF_CASE[case], case, row, name) for case, row, name in product(CASES, ("expert", "policy", "alpha"), FEATURES)]
     assert len(table) == 54
     assert set(table[["table", "case", "row", "feature"]].itertuples(index=False, name=None)) == set(keys)
     assert (table["n_seeds"] == 1).all()
     assert table[["published", "reproduced"]].notna().all(axis=None)
+    assert table[["ci_low", "ci_high", "pred_low", "pred_high"]].isna().all(axis=None)
+    assert set(table["verdict"]) == {"fitted", "cannot tell"}
+    assert set(table["reason"]) == {"one seed"}
     found = table.set_index(["case", "row", "feature"])
     assert found.loc[(1, "expert", "C_A-I"), "published"] == 21.63  # Table 2, first and last number of the paper
     assert found.loc[(3, "alpha", "T-III"), "published"] == -0.541
@@ -198,7 +214,8 @@ def test_seeds_hold_the_metrics_of_every_stage(written):
     expected = {
         "expert": v | {"objective"},
         "offline": v | alpha | COST | {"feature_gap", "objective"},
-        "online": v | COST | {"objective"},
+        "online": v | COST | {"objective", "share"},
+        "minimum_variance": v | {"objective"},
     }
     for case, (stage, metrics) in product(CASES, expected.items()):
         assert metrics <= set(table.query("case == @case and stage == @stage")["metric"]), (case, stage)
@@ -239,16 +256,62 @@ def test_a_seed_that_was_not_run_is_named(inputs):
     assert "seed_1/case_1/demonstrations/record.json" in refusal(inputs, PARAMS, 2)
 
 
-def test_several_seeds_are_compared_by_their_median(inputs):
-    for seed in (1, 2):
+@pytest.fixture
+def several(inputs):
+    """Six seeds that differ by their number in one feature of the offline policy, and are alike otherwise."""
+    for seed in range(1, 6):
         shutil.copytree(inputs / "smoke/seed_0", inputs / f"smoke/seed_{seed}")
-    results = collect(inputs, PARAMS, 3)
-    assert set(results.seeds["seed"]) == {0, 1, 2}
-    assert set(report.tabulate(results)["comparison"]["n_seeds"]) == {3}
+    return inputs
+
+
+def test_several_seeds_are_compared_by_median_and_intervals(several):
+    results = collect(several, PARAMS, 6)
+    assert set(results.seeds["seed"]) == set(range(6))
     rows = results.seeds.query("case == 1 and stage == 'offline' and metric == 'v:T-I'")
-    results.seeds.loc[rows.index, "value"] = [9.0, 1.0, 2.0]
-    table = report.tabulate(results)["comparison"].set_index(["case", "row", "feature"])
-    assert table.loc[(1, "policy", "T-I"), "reproduced"] == 2.0
+    results.seeds.loc[rows.index, "value"] = [9.0, 1.0, 2.0, 4.0, 3.0, 5.0]
+    table = report.tabulate(results)["comparison"]
+    assert set(table["n_seeds"]) == {6}
+    assert table[["ci_low", "ci_high", "pred_low", "pred_high"]].notna().all(axis=None)
+    row = table.set_index(["case", "row", "feature"]).loc[(1, "policy", "T-I")]
+    assert row["reproduced"] == 3.5
+    assert 1.0 <= row["ci_low"] < 3.5 < row["ci_high"] <= 9.0
+    middle, s = 4.0, 8.0**0.5
+    reach = 2.570582 * s * (7 / 6) ** 0.5  # t of five degrees of freedom; 100 trajectories carry more than the error of 500
+    assert row[["pred_low", "pred_high"]].tolist() == pytest.approx([middle - reach, middle + reach], rel=1e-6)
+
+
+def test_the_report_of_several_seeds_has_intervals_and_what_else_was_run(several, tmp_path):
+    """Claims, trials and the budget of plant episodes appear once their stages exist."""
+    trial = next(iter(collect(several).params[1].trials))
+    assert not {"claims", "trials"} & report.tabulate(collect(several)).keys()
+    for seed, case in product(range(6), CASES):
+        folder = several / f"smoke/seed_{seed}/case_{case}"
+        save_stage(folder / "experiments", {}, {"scores.csv": pd.DataFrame({"stage": ["x"], "metric": ["y"], "value": [1.0]})})
+        budget = pd.DataFrame({"episodes_per_epoch": [20, 500], "objective": [9.0 + seed, 12.0 + seed]})
+        save_stage(folder / "online_budget", {}, {"scores.csv": budget})
+        scores = pd.DataFrame({"stage": ["offline"], "metric": ["feature_gap"], "value": [0.1 + seed / 100]})
+        save_stage(folder / f"{'transfer' if case == 3 else 'offline'}_{trial}", {}, {"scores.csv": scores})
+    results = collect(several, PARAMS, 6)
+    folder = report.write(tmp_path / "report", results).parent
+    page = Page((folder / "report.html").read_text(encoding="utf-8"))
+    text = " ".join("".join(page.text).split())
+    for part in (
+        "with 6 seeds",
+        "95 % bootstrap interval",
+        "What was tried offline",
+        "The paper’s claims",
+        "Plant episodes",
+        "6 seeds",
+    ):
+        assert part in text
+    assert re.search(r"\bnan\b", text) is None
+    assert (folder / "figures/online_budget.svg").is_file()
+    trials = pd.read_csv(folder / "tables/trials.csv").set_index("trial")
+    assert trials.loc[trial, "case II, %"] == "12.5 (10.0 to 15.0; 6 seeds)"
+    assert list(trials.index[:2]) == ["improved", "printed"]
+    claims = pd.read_csv(folder / "tables/claims.csv")
+    assert {"id", "statement", "verdict", "reason"} <= set(claims)
+    assert len(page.named("img")) == len(page.named("figcaption"))
 
 
 def test_a_stage_made_with_other_parameters_is_refused_by_name(inputs, tmp_path):

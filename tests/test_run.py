@@ -12,7 +12,7 @@ import pytest
 
 from helpers import run
 from helpers.artifacts import load_stage
-from helpers.request import PROJECT
+from helpers.sources import PROJECT
 
 PAPERMILL = [sys.executable, "-m", "papermill", "--no-progress-bar"]
 

@@ -8,8 +8,9 @@ import torch
 
 from helpers.artifacts import save_stage
 from helpers.params import ParameterError
-from helpers.request import NOTEBOOK_PARAMETERS, PROJECT, SessionError, check_parameters
+from helpers.request import NOTEBOOK_PARAMETERS, SessionError, check_parameters
 from helpers.session import open_report, open_session, parameters_hash
+from helpers.sources import PROJECT
 
 NOTEBOOKS = sorted(path.stem for path in (PROJECT / "notebooks").glob("[0-9]*.ipynb"))
 OFFLINE, REPORT = "02_offline_irl", "05_report"

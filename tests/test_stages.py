@@ -15,8 +15,8 @@ from safetensors.torch import save as save_tensors
 from helpers import stages
 from helpers.artifacts import ArtifactError
 from helpers.policy import LSTMPolicy
-from helpers.request import PROJECT
 from helpers.session import open_session
+from helpers.sources import PROJECT
 
 EPOCHS_OF_THE_PAPER = {1: (300, [10, 10]), 2: (250, [10, 10]), 3: (80, [10, 10])}
 EPISODES_OF_AN_EPOCH = 500
@@ -24,7 +24,7 @@ COST = {"epochs", "episodes", "gradient_steps"}
 FEATURES = {"C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III"}
 CONTROL = {"objective", "objective_x", "objective_y"}
 CONTROL |= {f"{kind}:{loop}" for kind in ("overshoot", "offset", "rise_time") for loop in ("C_A", "T")}
-CONTROL |= {"movement:C_A0", "movement:T_E"} | {f"v:{name}" for name in FEATURES}
+CONTROL |= {"movement:C_A0", "movement:T_E"} | {f"v:{name}{what}" for name in FEATURES for what in ("", ":std")}
 
 
 def session(case=1, variant="improved", scale="smoke", **given):

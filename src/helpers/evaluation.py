@@ -89,7 +89,8 @@ def scores(
 
     objective, objective_x and objective_y: mean discounted tracking objective with this beta, on the signal that the
     features are evaluated on, on x and on y; then one figure a loop (overshoot, offset over the last `n_last` samples,
-    rise_time), one an input (movement) and one a feature (v).
+    rise_time), one an input (movement) and two a feature: v, and v:<feature>:std, its standard deviation over the
+    trajectories, which says how large the sampling error of any number of them is.
     """
     rows = {"objective": objective(trajectories, features, beta).mean().item()}
     for signal in ("x", "y"):
@@ -101,5 +102,6 @@ def scores(
     ):
         rows |= {f"{name}:{loop}": value for loop, value in zip(controlled, values.tolist(), strict=True)}
     rows |= {f"movement:{name}": value for name, value in zip(manipulated, input_movement(trajectories).tolist(), strict=True)}
-    mean = features.trajectory(trajectories).mean(0).tolist()
-    return rows | {f"v:{name}": value for name, value in zip(feature_names(controlled), mean, strict=True)}
+    names, v = feature_names(controlled), features.trajectory(trajectories)
+    rows |= {f"v:{name}": value for name, value in zip(names, v.mean(0).tolist(), strict=True)}
+    return rows | {f"v:{name}:std": value for name, value in zip(names, v.std(0).tolist(), strict=True)}

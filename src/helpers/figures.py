@@ -1,6 +1,7 @@
-"""Figures 3-6 and learning curves.
+"""Figures 3-6, learning curves and the curve of the online budget.
 
-Every function returns a Figure and computes no result; `drawn_summary` reads back what was really drawn.
+Every table may hold several runs, told apart by a column `seed`: each is then a thin line, their median a thick one. Every
+figure is drawn from tables and computes no result; `drawn_summary` reads back what was really drawn.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,13 +11,14 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import seaborn as sns
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
 from helpers.params import DEVIATION
 from helpers.tables import feature_symbol, symbol
@@ -34,6 +36,16 @@ STYLE = {
     "ytick.labelsize": 9,
     "legend.fontsize": 9.5,
     "lines.linewidth": 1.6,
+    "lines.solid_capstyle": "round",
+    "axes.edgecolor": "#262626",
+    "axes.labelcolor": "#262626",
+    "text.color": "#262626",
+    "xtick.color": "#262626",
+    "ytick.color": "#262626",
+    "axes.linewidth": 1.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
     "axes.grid": True,
     "grid.color": "#e8e8e8",
     "grid.linewidth": 0.7,
@@ -56,8 +68,12 @@ LINE_STYLES: dict[str, Any] = {"agent": "-", "expert": (0, (4, 1.6)), "set point
 KIND_STYLES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.2, 1, 1.2)))
 BAND_OPACITY = 0.2
 BAND = "mean ± standard deviation"
+SINGLE = "single seeds"
+THIN = 0.7  # width of the line of a single seed
+LOOP_COLOURS = ("#0173b2", "#de8f05", "#029e73", "#d55e00", "#cc78bc", "#ca9161")  # told apart by the colour-blind too
 TIME_LABEL = "control interaction (sample)"
 FEW_POINTS = 40  # a curve of at most that many points shows each of them
+MANY_POINTS = 1000  # thin lines of more points become a picture inside the SVG, which would be ten times as large
 
 INK = "#333333"
 MUTED = "#6e6e6e"
@@ -65,7 +81,7 @@ MUTED = "#6e6e6e"
 
 def use_style() -> None:
     """One style for all figures, for the whole session: much of it counts only when a figure is written or shown."""
-    sns.set_theme(context="paper", style="ticks", rc=STYLE)
+    plt.rcParams.update(STYLE)
 
 
 use_style()
@@ -110,7 +126,7 @@ def control_figure(
     a bound can pass it: it is a standard deviation, not a range.
 
     Args:
-        response: columns of `response_table`.
+        response: columns of `response_table`, and `seed` where there are several runs.
         set_point: of each loop, deviation variables.
         descriptions: of variables in words, by name.
         zoom_from: first sample of the zoom.
@@ -133,7 +149,7 @@ def control_figure(
         _finish(zoom, ascii_uppercase[n_loops + loop], output, words, zoom_from)
         zoom.set_xlabel(TIME_LABEL)
     figure.align_ylabels()
-    _legend(figure, ("controlled", "manipulated"), agent_label, expert_label)
+    _legend(figure, response, ("controlled", "manipulated"), agent_label, expert_label)
     return figure
 
 
@@ -154,7 +170,7 @@ def tracking_figure(
         _draw_response(axes, early, output, target)
         _finish(axes, ascii_uppercase[loop], output, descriptions or {})
         axes.set_xlabel(TIME_LABEL)
-    _legend(figure, ("controlled",), agent_label, expert_label)
+    _legend(figure, response, ("controlled",), agent_label, expert_label)
     return figure
 
 
@@ -167,7 +183,7 @@ def learning_curves(
     """Mean return, feature gap and reward weights against the epoch; a panel for each that the history holds.
 
     Args:
-        history: columns epochs and mean_return, and where they exist feature_gap and alpha:<feature>.
+        history: columns epochs and mean_return, and where they exist feature_gap, alpha:<feature> and seed.
         marks: epochs worth a vertical line, and why.
         return_levels, gap_levels: horizontal lines by label, such as the expert's return or the paper's gap.
     """
@@ -175,17 +191,18 @@ def learning_curves(
     panels = ["mean return", *(["feature gap"] if "feature_gap" in history and history["feature_gap"].notna().any() else [])]
     panels += ["reward weights"] if weights else []
     figure = empty_figure(max(6.0, WIDTH / 3 * len(panels)), 4.0)
-    points: Any = {"marker": "o" if len(history) <= FEW_POINTS else "", "markersize": 3}
     epochs = history["epochs"]
+    points: Any = {"marker": "o" if epochs.nunique() <= FEW_POINTS else "", "markersize": 3}
+    n_seeds = _n_seeds(history)
     for index, panel in enumerate(panels):
         axes = figure.add_subplot(1, len(panels), index + 1)
         levels: Mapping[str, float] = {}
         if panel == "mean return":
-            axes.plot(epochs, history["mean_return"], color=INK, label=panel, **points)
+            _draw_runs(axes, history, "epochs", "mean_return", color=INK, label=panel, **points)
             axes.set_ylabel("discounted return (no unit)")
             levels = return_levels or {}
         elif panel == "feature gap":
-            axes.plot(epochs, history["feature_gap"], color=INK, label=panel, **points)
+            _draw_runs(axes, history, "epochs", "feature_gap", color=INK, label=panel, **points)
             axes.set_ylabel("gap to the expert (%, log scale)")
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter(FuncFormatter(_percent))
@@ -194,9 +211,11 @@ def learning_curves(
         else:
             styles = feature_styles([column.removeprefix("alpha:") for column in weights])
             for column, (label, style) in zip(weights, styles.items(), strict=True):
-                axes.plot(epochs, history[column], label=label, **style, **points)
+                _draw_runs(axes, history, "epochs", column, label=label, **style, **points)
             axes.set_ylabel("weight (no unit)")
-        listed = [line for line in axes.lines if panel == "reward weights"]
+        listed: list[Line2D] = [line for line in axes.lines if panel == "reward weights"]
+        if n_seeds > 1 and panel == "mean return":
+            listed += _seed_handles(n_seeds)
         for (name, level), style in zip(levels.items(), cycle(KIND_STYLES[1:]), strict=False):
             listed += axes.plot([epochs.min(), epochs.max()], [level, level], color=LEVEL, linestyle=style, label=name)
         for (epoch, name), style in zip((marks or {}).items(), cycle(KIND_STYLES[2:]), strict=False):
@@ -214,7 +233,43 @@ def learning_curves(
         axes.set_xlabel("epoch")
         axes.xaxis.set_major_locator(MaxNLocator(5, integer=True, steps=[1, 2, 5, 10]))
         axes.set_label(f"{letter} {panel}")
-        sns.despine(ax=axes)
+    return figure
+
+
+def budget_curve(axes: Axes, frame: pd.DataFrame, reference: Mapping[str, float]) -> Axes:
+    """The objective after online learning against the plant episodes that each epoch was given.
+
+    Args:
+        frame: columns seed, episodes_per_epoch, objective, of one case.
+        reference: objectives to compare with, by label: horizontal lines.
+    """
+    _draw_runs(axes, frame, "episodes_per_epoch", "objective", color=COLOURS["controlled", "agent"], label="online", marker="o")
+    episodes = np.sort(frame["episodes_per_epoch"].unique())
+    for (name, level), style in zip(reference.items(), cycle(KIND_STYLES[1:]), strict=False):
+        axes.plot(episodes[[0, -1]], [level, level], color=LEVEL, linestyle=style, linewidth=1.2, label=name)
+    axes.set_xscale("log")
+    axes.set_xticks(episodes, [f"{number:g}" for number in episodes])
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xlabel("plant episodes per epoch (log)")
+    axes.set_ylabel("tracking objective $J$ (no unit)")
+    return axes
+
+
+def budget_figure(frame: pd.DataFrame, references: Mapping[int, Mapping[str, float]], titles: Mapping[int, str]) -> Figure:
+    """`budget_curve` for every case side by side.
+
+    Args:
+        frame: columns seed, case, episodes_per_epoch, objective.
+        references, titles: by case.
+    """
+    cases = sorted(frame["case"].unique())
+    figure = empty_figure(max(6.0, WIDTH / 3 * len(cases)), 3.8)
+    for index, case in enumerate(cases):
+        axes = budget_curve(figure.add_subplot(1, len(cases), index + 1), frame[frame["case"] == case], references[case])
+        axes.set_title(f"$\\mathbf{{{ascii_uppercase[index]}}}$  {titles[case]}", loc="left")
+        axes.set_label(f"{ascii_uppercase[index]} case {case}")
+    handles = [*figure.axes[0].lines, *_seed_handles(_n_seeds(frame))[:1]]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 
@@ -223,9 +278,11 @@ def feature_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     parts = {name: name.rpartition("-") for name in names}
     loops = list(dict.fromkeys(loop for loop, _, _ in parts.values()))
     kinds = list(dict.fromkeys(kind for _, _, kind in parts.values()))
-    palette = sns.color_palette("colorblind", len(loops))
     return {
-        feature_symbol(name): {"color": palette[loops.index(loop)], "linestyle": KIND_STYLES[kinds.index(kind) % len(KIND_STYLES)]}
+        feature_symbol(name): {
+            "color": LOOP_COLOURS[loops.index(loop) % len(LOOP_COLOURS)],
+            "linestyle": KIND_STYLES[kinds.index(kind) % len(KIND_STYLES)],
+        }
         for name, (loop, _, kind) in parts.items()
     }
 
@@ -256,7 +313,10 @@ def empty_figure(width: float, height: float) -> Figure:
 
 
 def _draw_response(axes: Axes, response: pd.DataFrame, variable: str, set_point: float | None = None) -> None:
-    """Mean and band of one variable under expert and agent; an input is drawn as held until the next sample."""
+    """Mean and band of one variable under expert and agent; an input is drawn as held until the next sample.
+
+    Of several runs the medians of mean and standard deviation at each sample, and the mean of each run as a thin line.
+    """
     for controller in ("expert", "agent"):
         rows = response[(response["controller"] == controller) & (response["variable"] == variable)]
         if rows.empty:
@@ -264,10 +324,13 @@ def _draw_response(axes: Axes, response: pd.DataFrame, variable: str, set_point:
         kind = rows["kind"].iloc[0]
         held: Any = {}
         if kind == "manipulated":
-            rows = pd.concat([rows, rows.tail(1).assign(time_index=rows["time_index"].max() + 1)])
+            last = rows["time_index"].max()
+            rows = pd.concat([rows, rows[rows["time_index"] == last].assign(time_index=last + 1)])
             held = {"step": "post"}
         colour, label = COLOURS[kind, controller], f"{kind}, {controller}"
-        time, mean, std = rows["time_index"], rows["mean"], rows["std"]
+        _draw_singles(axes, rows, "time_index", "mean", colour, held=bool(held))
+        middle = rows.groupby("time_index")[["mean", "std"]].median()
+        time, mean, std = middle.index.to_numpy(), middle["mean"].to_numpy(), middle["std"].to_numpy()
         axes.fill_between(
             time, mean - std, mean + std, color=colour, alpha=BAND_OPACITY, linewidth=0, label=f"{label}: {BAND}", **held
         )
@@ -280,6 +343,38 @@ def _draw_response(axes: Axes, response: pd.DataFrame, variable: str, set_point:
     axes.set_xlim(*limits)
 
 
+def _n_seeds(frame: pd.DataFrame) -> int:
+    return int(frame["seed"].nunique()) if "seed" in frame else 1
+
+
+def _draw_runs(axes: Axes, frame: pd.DataFrame, x: str, y: str, **style: Any) -> None:
+    """The median over the runs at every x, and each run as a thin line where there are several."""
+    _draw_singles(axes, frame, x, y, style["color"])
+    middle = frame.groupby(x)[y].median()
+    axes.plot(middle.index, middle, **style)
+
+
+def _draw_singles(axes: Axes, frame: pd.DataFrame, x: str, y: str, colour: str, held: bool = False) -> None:
+    """Each of several runs as a thin line, with steps where a value is `held` until the next x; the fainter, the more they are."""
+    n_seeds = _n_seeds(frame)
+    if n_seeds < 2:
+        return
+    lines = []
+    for _, run in frame.sort_values(x).groupby("seed"):
+        points = run[[x, y]].to_numpy(dtype=float)
+        lines.append(np.column_stack([points[:, 0].repeat(2)[1:], points[:, 1].repeat(2)[:-1]]) if held else points)
+    thin: Any = {"linewidth": THIN, "alpha": max(0.4, 1 / n_seeds**0.5), "rasterized": len(frame) > MANY_POINTS}
+    pale = (np.array(to_rgb(colour)) + 1) / 2  # many of them on one another stay lighter than the median
+    axes.add_collection(LineCollection(lines, label=SINGLE, color=pale, **thin))
+    axes.autoscale_view()
+
+
+def _seed_handles(n_seeds: int) -> list[Line2D]:
+    """What thin and thick lines mean, for a legend."""
+    thin = Line2D([], [], color=INK, linewidth=THIN, label=f"thin: each of {n_seeds} seeds")
+    return [thin, Line2D([], [], color=INK, label="thick: their median")]
+
+
 def _finish(axes: Axes, letter: str, variable: str, descriptions: Mapping[str, str], zoom_from: int | None = None) -> None:
     """Title, label and unit of a panel; the letter of a panel stands on its first axes only."""
     words = descriptions.get(variable, "")
@@ -290,20 +385,23 @@ def _finish(axes: Axes, letter: str, variable: str, descriptions: Mapping[str, s
     axes.set_ylabel(f"{symbol(variable)} ({DEVIATION})".replace(", ", ",\n"))
     axes.set_label(" ".join(part for part in (letter, variable, "" if zoom_from is None else "zoom") if part))
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True, steps=[1, 2, 5, 10]))
-    sns.despine(ax=axes)
 
 
-def _legend(figure: Figure, kinds: Sequence[str], agent_label: str, expert_label: str) -> None:
+def _legend(figure: Figure, response: pd.DataFrame, kinds: Sequence[str], agent_label: str, expert_label: str) -> None:
     """Every line and band of the figure, below its panels."""
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=COLOURS[kind, controller], linestyle=LINE_STYLES[controller], label=f"{kind} variable, {label}")
         for kind in kinds
         for controller, label in (("agent", agent_label), ("expert", expert_label))
     ]
-    handles.append(Line2D([], [], color=SET_POINT, linestyle=LINE_STYLES["set point"], linewidth=2, label="set point"))
-    handles.append(Patch(facecolor="#888888", alpha=0.35, label=f"line and band: {BAND}"))
-    if len(kinds) > 1:  # a legend fills column by column: one for the outputs, one for the inputs
-        handles = [*handles[:2], handles[4], *handles[2:4], handles[5]]
+    n_seeds = _n_seeds(response)
+    over = f", medians over {n_seeds} seeds" if n_seeds > 1 else ""
+    below = [Line2D([], [], color=SET_POINT, linestyle=LINE_STYLES["set point"], linewidth=2, label="set point")]
+    if n_seeds > 1:
+        below.append(Line2D([], [], color=INK, linewidth=THIN, label="thin lines: the mean of each seed"))
+    band = Patch(facecolor="#888888", alpha=0.35, label=f"line and band: {BAND}{over}")
+    # A legend fills column by column: one for the outputs, one for the inputs, where there are both.
+    handles = [*handles[:2], *below, *handles[2:], band]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
 
 

@@ -5,7 +5,9 @@ unit and range, and `leaves` lists them all for the report. Whatever is wrong wi
 the file, the key and what was expected.
 """
 
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -176,22 +178,27 @@ class FeatureParams(Record):
     initial_error: Annotated[NotNegative, Leaf("-")]
 
 
-class PolicyParams(Record):
+class ExplorationParams(Record):
+    """How far the policy explores: its standard deviation at the start of learning and between which limits it is learnt."""
+
+    std_low: Annotated[Positive, Leaf("input range")]
+    std_high: Annotated[Positive, Leaf("input range")]
+    initial_std: Annotated[Positive, Leaf("input range")]
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if not self.std_low <= self.initial_std <= self.std_high or self.std_low == self.std_high:
+            raise PydanticCustomError("std", "expected std_low <= initial_std <= std_high and std_low < std_high")
+        return self
+
+
+class PolicyParams(ExplorationParams):
     """The network and the distribution of the policy, Section 3.2."""
 
     hidden_cells: Annotated[tuple[Count, ...], Field(min_length=1), Leaf("cells")]
     leaky_slope: Annotated[NotNegative, Leaf("-")]
     error_unit: Annotated[tuple[Positive, ...], Leaf(DEVIATION)]
     initial_output_scale: Annotated[Positive, Leaf("1/sqrt(cells)")]
-    std_low: Annotated[Positive, Leaf("input range")]
-    std_high: Annotated[Positive, Leaf("input range")]
-    initial_std: Annotated[Positive, Leaf("input range")]
-
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        if not self.std_low <= self.initial_std <= self.std_high or self.std_low == self.std_high:
-            raise PydanticCustomError("std", "expected std_low <= initial_std <= std_high and std_low < std_high")
-        return self
 
 
 class ScaleParams(Record):
@@ -218,12 +225,15 @@ class LearnerParams(Record):
 
     credit: Annotated[Literal["whole_return", "reward_to_go"], Leaf("-")]
     credit_decay: Annotated[Share, Leaf("-")]
-    minibatches: Annotated[Count, Leaf("per epoch")]
+    passes: Annotated[Count, Leaf("per epoch")]
+    minibatches: Annotated[Count, Leaf("per pass")]
     ratio_clip: Annotated[Positive, Leaf("-")]
     learning_rate_start: Annotated[Share, Leaf("-")]
     learning_rate_end: Annotated[Share, Leaf("-")]
     averaging: Annotated[Memory, Leaf("-")]
     patience: Annotated[int, Strict(), Field(ge=0), Leaf("epochs")]
+    entropy: Annotated[NotNegative, Leaf("-")] = 0.0
+    trust_region: Annotated[Positive, Leaf("nats")] | None = None
 
 
 class WeightParams(Record):
@@ -247,16 +257,47 @@ class WeightParams(Record):
 
 
 class VariantParams(Record):
-    """One variant of Algorithms 1 and 2."""
+    """One variant of Algorithms 1 and 2. Without `exploration` the policy explores as its own parameters say."""
 
     learner: LearnerParams
     weights: WeightParams
+    exploration: ExplorationParams | None = None
+
+
+class TrialParams(Record):
+    """params/trials.yaml: a trial of offline learning, as the changes that it makes to a variant.
+
+    `learner`, `weights` and `exploration` hold the changed leaves as the file has them.
+    """
+
+    base: Text
+    title: Text
+    family: Literal[
+        "step size",
+        "averaging of alpha",
+        "weights",
+        "kept policy",
+        "entropy",
+        "clipped ratio",
+        "natural gradient",
+        "exploration",
+        "credit",
+    ]
+    learner: dict[str, Any] = Field(default_factory=dict)
+    weights: dict[str, Any] = Field(default_factory=dict)
+    exploration: dict[str, Any] = Field(default_factory=dict)
+
+    @property
+    def changes(self) -> dict[str, dict[str, Any]]:
+        """The changed leaves by part of a variant."""
+        return {name: part for name in ("learner", "weights", "exploration") if (part := getattr(self, name))}
 
 
 class OnlineLearningParams(Record):
     """Algorithm 1 under the real objective."""
 
     episodes: Annotated[Count, Field(gt=1, le=EPISODES_PER_EPOCH), Leaf("episodes")]
+    exploration: ExplorationParams
     learner: LearnerParams
 
 
@@ -268,9 +309,14 @@ class LearningParams(Record):
     variants: dict[Text, VariantParams]
     online: OnlineLearningParams
 
+    @property
+    def fewest_episodes(self) -> int:
+        """Episodes of an epoch at the smallest scale, which every minibatch must share."""
+        return min(scale.episodes for scale in self.scales.values())
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        fewest = min(scale.episodes for scale in self.scales.values())
+        fewest = self.fewest_episodes
         for learner in (self.online.learner, *(variant.learner for variant in self.variants.values())):
             if learner.minibatches > fewest:
                 raise PydanticCustomError("batch", "'minibatches' exceeds the {fewest} episodes of a scale", {"fewest": fewest})
@@ -357,9 +403,137 @@ class PublishedCase(Record):
         return sum(abs(policy - expert) / abs(expert) for policy, expert in pairs) / len(pairs)
 
 
+class ComparisonParams(Record):
+    """How controllers are compared."""
+
+    n_last: Annotated[Count, Leaf("samples")]
+    band: Annotated[Positive, Leaf("share of the set point change")]
+    beta: Annotated[Positive, Leaf("-")]
+
+
+class ExperimentCases(Record):
+    """The cases in which an experiment is run."""
+
+    cases: Annotated[tuple[Count, ...], Leaf("case")]
+
+
+class FrozenWeightsParams(ExperimentCases):
+    """A policy from scratch under weights that stay as they are."""
+
+    epochs: Annotated[Count, Leaf("epochs")]
+
+
+class BetaParams(ExperimentCases):
+    """Online learning at several values of beta."""
+
+    betas: Annotated[tuple[Positive, ...], Field(min_length=1), Leaf("-")]
+
+
+class BaselineParams(ExperimentCases):
+    """The spread of the policy gradient with and without the baseline of Algorithm 1."""
+
+    batches: Annotated[Count, Field(gt=1), Leaf("batches")]
+    episodes: Annotated[Count, Field(gt=1), Leaf("episodes")]
+
+
+class OtherDemonstratorParams(ExperimentCases):
+    """Demonstrators other than the PID."""
+
+    epochs: Annotated[Count, Leaf("epochs")]
+    horizon: Annotated[Count, Leaf("samples")]
+    move_penalty: Annotated[Positive, Leaf("-")]
+    by_hand: Annotated[Text, Leaf("-")]
+    held: Annotated[Real, Leaf(DEVIATION)]
+    threshold: Annotated[NotNegative, Leaf("-")]
+    rest_std: Annotated[Share, Leaf("share of initial_std")]
+
+
+class CloningParams(ExperimentCases):
+    """Behavioural cloning."""
+
+    demonstrations: Annotated[tuple[Annotated[Count, Field(gt=1)], ...], Field(min_length=1), Leaf("trajectories")]
+    steps: Annotated[Count, Leaf("gradient steps")]
+    batch: Annotated[Count, Leaf("trajectories")]
+    learning_rate_start: Annotated[Share, Leaf("-")]
+    learning_rate_end: Annotated[Share, Leaf("-")]
+    validation: Annotated[Positive, Field(lt=1), Leaf("share")]
+    check_every: Annotated[Count, Leaf("gradient steps")]
+
+
+class FewerDemonstrationsParams(ExperimentCases):
+    """Algorithm 2 on a part of the demonstrations."""
+
+    demonstrations: Annotated[tuple[Annotated[Count, Field(gt=1)], ...], Field(min_length=1), Leaf("trajectories")]
+    epochs: Annotated[Count, Leaf("epochs")]
+
+
+class ConditionParams(Record):
+    """Conditions that no learning has seen."""
+
+    initial_shift: Annotated[Vector, Leaf("initial_std")]
+    set_point_factor: Annotated[tuple[NotZero, ...], Field(min_length=1), Leaf("share of set_point")]
+    disturbance_factor: Annotated[Positive, Leaf("share of disturbance")]
+
+
+class ExperimentParams(Record):
+    """params/experiments.yaml: the extra runs behind the claims."""
+
+    comparison: ComparisonParams
+    frozen_weights: FrozenWeightsParams
+    undiscounted: ExperimentCases
+    beta: BetaParams
+    baseline: BaselineParams
+    feature_sets: ExperimentCases
+    demonstrators: OtherDemonstratorParams
+    cloning: CloningParams
+    fewer_demonstrations: FewerDemonstrationsParams
+    conditions: ConditionParams
+
+
+class SearchParams(Record):
+    """Upper ends of the search for the inferred settings, one entry an input or a control loop."""
+
+    sampling_time: Annotated[Positive, Leaf("time")]
+    input_bound: Annotated[tuple[Positive, ...], Leaf(DEVIATION)]
+    proportional: Annotated[tuple[Positive, ...], Leaf("input/output")]
+    integral: Annotated[tuple[Positive, ...], Leaf("input/(output time)")]
+    derivative: Annotated[tuple[Positive, ...], Leaf("input time/output")]
+
+
+class IdentificationScaleParams(Record):
+    """How much the search for the inferred settings computes."""
+
+    starts: Annotated[Count, Leaf("starts")]
+    evaluations: Annotated[Count, Leaf("evaluations")]
+    evaluations_reading: Annotated[Count, Leaf("evaluations")]
+    draws_search: Annotated[Count, Field(gt=1), Leaf("trajectories")]
+    draws: Annotated[Count, Field(gt=1), Leaf("trajectories")]
+    draws_final: Annotated[Count, Field(gt=1), Leaf("trajectories")]
+    iterations: Annotated[Count, Leaf("iterations")]
+    profile_steps: Annotated[Count, Leaf("steps to each side")]
+    fresh: Annotated[Count, Field(gt=1), Leaf("trajectories")]
+
+
+class IdentificationParams(Record):
+    """params/identification.yaml: how the settings that the paper leaves out are inferred."""
+
+    sample: Annotated[Count, Leaf("trajectories")]
+    settled_by: Annotated[Text, Leaf("-")]
+    overdamped: Annotated[Text, Leaf("-")]
+    overshoot_unit: Annotated[Positive, Leaf("share of the set point change")]
+    interval: Annotated[Positive, Leaf("-")]
+    identified: Annotated[Positive, Leaf("share of the value")]
+    search: SearchParams
+    scales: dict[Text, IdentificationScaleParams]
+
+
 @dataclass(frozen=True)
 class Params:
-    """Everything that one stage of one case needs to know, and `leaves`: a row for the report for every leaf read."""
+    """Everything that one stage of one case needs to know, and `leaves`: a row for the report for every leaf read.
+
+    The variants of `learning` include the trials of offline learning; `trials` says which they are. Their leaves are not
+    among `leaves`, because no other result depends on them.
+    """
 
     process: ProcessParams
     demonstrator: GainParams
@@ -367,6 +541,11 @@ class Params:
     learning: LearningParams
     case: CaseParams
     leaves: tuple[dict[str, Any], ...]
+    trials: Mapping[str, TrialParams] = field(default_factory=dict)
+
+    def base(self, variant: str) -> str:
+        """The variant whose random numbers a variant meets: a trial's base, so that the two can be compared seed by seed."""
+        return self.trials[variant].base if variant in self.trials else variant
 
 
 def load(root: Path, case: int) -> Params:
@@ -406,14 +585,47 @@ def load(root: Path, case: int) -> Params:
         path = root / "process.yaml"
         raise ParameterError(f"{path}: key 'manipulated': a PID pairs {n_controlled} loops, found {n_manipulated} inputs")
     leaves = tuple(row for name in names for row in list_leaves(raw[name], name))
+    trials = load_trials(root)
+    variants = {name: _trial_variant(root, name, trial, learning, raw["learning.yaml"]) for name, trial in trials.items()}
     return Params(
         process=process,
         demonstrator=gains,
         features=validate(FeatureParams, raw["features.yaml"], root / "features.yaml"),
-        learning=learning,
+        learning=learning.model_copy(update={"variants": learning.variants | variants}),
         case=record,
         leaves=leaves,
+        trials=trials,
     )
+
+
+def load_trials(root: Path) -> dict[str, TrialParams]:
+    """The trials of offline learning by name, from trials.yaml."""
+    path = root / "trials.yaml"
+    trials = {}
+    for name, entry in read_yaml(path).items():
+        if not re.fullmatch("[a-z][a-z0-9_]*", name):  # it becomes the name of a folder
+            raise ParameterError(f"{path}: key '{name}': expected a name of small letters, digits and underscores")
+        trials[name] = validate(TrialParams, entry, path, name)
+        if not trials[name].changes:
+            raise ParameterError(f"{path}: key '{name}': the trial changes nothing")
+    return trials
+
+
+def _trial_variant(root: Path, name: str, trial: TrialParams, learning: LearningParams, raw: dict[str, Any]) -> VariantParams:
+    """The variant that a trial's changes make of its base; `raw` is the content of learning.yaml."""
+    path = root / "trials.yaml"
+    known = ", ".join(learning.variants)
+    if name in learning.variants:
+        raise ParameterError(f"{path}: key '{name}': a trial needs a name other than those of the variants, {known}")
+    if trial.base not in learning.variants:
+        raise ParameterError(f"{path}: key '{name}.base': expected one of {known}, found '{trial.base}'")
+    base = raw["variants"][trial.base]
+    merged = base | {part: base.get(part, {}) | changes for part, changes in trial.changes.items()}
+    variant = validate(VariantParams, merged, path, name)
+    if variant.learner.minibatches > learning.fewest_episodes:
+        key = f"{name}.learner.minibatches"
+        raise ParameterError(f"{path}: key '{key}': exceeds the {learning.fewest_episodes} episodes of a scale")
+    return variant
 
 
 def load_published(root: Path) -> dict[int, PublishedCase]:
@@ -426,6 +638,37 @@ def load_published(root: Path) -> dict[int, PublishedCase]:
             raise ParameterError(f"{path}: key '{key}': expected case_ and a number")
         published[int(number)] = validate(PublishedCase, entry, path, key)
     return published
+
+
+def load_experiments(root: Path, params: Params) -> ExperimentParams:
+    """The settings of the extra runs, from experiments.yaml, for the process of a case."""
+    path = root / "experiments.yaml"
+    record = validate(ExperimentParams, read_yaml(path), path)
+    if record.demonstrators.by_hand not in params.process.manipulated:
+        known, found = ", ".join(params.process.manipulated), record.demonstrators.by_hand
+        raise ParameterError(f"{path}: key 'demonstrators.by_hand': expected one of {known}, found '{found}'")
+    expected = len(params.process.controlled)
+    for name in ("initial_shift", "set_point_factor"):
+        value = getattr(record.conditions, name)
+        if len(value) != expected:
+            key = f"conditions.{name}"
+            raise ParameterError(f"{path}: key '{key}': expected {expected} entries, one a variable, found {len(value)}")
+    return record
+
+
+def load_identification(root: Path, params: Params) -> IdentificationParams:
+    """How the inferred settings are found, from identification.yaml, for the process of a case."""
+    path = root / "identification.yaml"
+    record = validate(IdentificationParams, read_yaml(path), path)
+    expected = len(params.process.controlled)
+    for name in ("input_bound", "proportional", "integral", "derivative"):
+        value = getattr(record.search, name)
+        if len(value) != expected:
+            raise ParameterError(f"{path}: key 'search.{name}': expected {expected} entries, one a loop, found {len(value)}")
+    for scale in params.learning.scales:
+        if scale not in record.scales:
+            raise ParameterError(f"{path}: key 'scales.{scale}': the key is missing")
+    return record
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from helpers.lstm import Tape, Unroll, stacked
-from helpers.params import PolicyParams
+from helpers.params import ExplorationParams, PolicyParams
 from helpers.task import ControlTask
 
 RELU6_TOP = 6.0  # Eq. 3.2.5
@@ -37,6 +37,16 @@ class Scaling:
         """Mean and standard deviation, each (..., n_u), from the output layer before its activation."""
         mean, std = torch.addcmul(self.shift, functional.relu6(output), self.factor).chunk(2, dim=-1)
         return mean, std
+
+
+def log_density(command: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """ln of the density of independent normal inputs, summed over them; (..., n_u) to (...)."""
+    return (-(((command - mean) / std) ** 2) / 2 - std.log() - math.log(2 * math.pi) / 2).sum(-1)
+
+
+def entropy(std: Tensor, task: ControlTask) -> Tensor:
+    """Entropy of independent normal inputs, each as a share of its range, summed over them; (..., n_u) to (...)."""
+    return ((std / (task.input_high - task.input_low)).log() + (1 + math.log(2 * math.pi)) / 2).sum(-1)
 
 
 class LSTMPolicy(nn.Module):
@@ -79,8 +89,13 @@ class LSTMPolicy(nn.Module):
         policy.reset_exploration()
         return policy
 
-    def reset_exploration(self) -> None:
-        """Set the standard deviation to its initial value everywhere, so that a policy carried over can explore again."""
+    def reset_exploration(self, exploration: ExplorationParams | None = None) -> None:
+        """Set the standard deviation to its initial value everywhere, so that a policy carried over can explore again.
+
+        With `exploration` its limits change too; without, they stay those of the policy.
+        """
+        if exploration is not None:
+            self.params = self.params.model_copy(update=exploration.model_dump())
         params, rows = self.params, slice(self.n_manipulated, None)
         with torch.no_grad():
             self.output.weight[rows] = 0
@@ -131,8 +146,7 @@ class LSTMPolicy(nn.Module):
 
         The probability is that of the command before it was clipped to the bounds, which is what the policy drew.
         """
-        mean, std = self.unrolled(y, u, task, tapes)
-        return (-(((command - mean) / std) ** 2) / 2 - std.log() - math.log(2 * math.pi) / 2).sum(-1)
+        return log_density(command, *self.unrolled(y, u, task, tapes))
 
 
 @dataclass

@@ -28,6 +28,9 @@ class LinearProcess:
     """Euler-Maruyama integration of Eq. 4.1.3 with the observation of Eq. 4.1.4, in deviation variables.
 
     x_{t+1} = x_t + (A x_t + B u_t) dt + diag(d) x_t sqrt(dt) w_t,  y_t = (1 + s v_t) x_t,  w, v ~ N(0, I).
+
+    Attributes:
+        state_step, input_step: I + A dt (n_x, n_x) and B dt (n_x, n_u), the expected step of one sample.
     """
 
     def __init__(self, params: ProcessParams, dtype: torch.dtype) -> None:
@@ -39,9 +42,10 @@ class LinearProcess:
         self.drift_input = torch.tensor(params.drift_input, dtype=dtype)
         self.disturbance_gain = torch.tensor(params.disturbance, dtype=dtype)
         self.observation_noise = torch.tensor(params.observation_noise, dtype=dtype)
-        # One step as two products, so that the rollout does no work twice: x + h dt = x (I + A dt)' + u (B dt)'.
-        self._state_step = (torch.eye(self.n_states, dtype=dtype) + self.drift_state * self.sampling_time).T.contiguous()
-        self._input_step = (self.drift_input * self.sampling_time).T.contiguous()
+        # One step as two products, so that the rollout does no work twice: x + h dt = (I + A dt) x + (B dt) u.
+        self.state_step = torch.eye(self.n_states, dtype=dtype) + self.drift_state * self.sampling_time
+        self.input_step = self.drift_input * self.sampling_time
+        self._state_step, self._input_step = self.state_step.T.contiguous(), self.input_step.T.contiguous()
         self._disturbance_step = self.disturbance_gain * self.sampling_time**0.5
 
     def drift(self, x: Tensor, u: Tensor) -> Tensor:

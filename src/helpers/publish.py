@@ -3,13 +3,15 @@
 import json
 import shutil
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from helpers.artifacts import code_revision
-from helpers.request import PROJECT
+from helpers.sources import PROJECT
+from helpers.tables import ROMAN, spread
 
 LATEST, REFERENCE, RESULTS = PROJECT / "reports/latest", PROJECT / "reports/reference", PROJECT / "results"
 PARTS = ("report.html", "figures", "tables", "comparison.csv", "seeds.csv", "provenance.json")
@@ -32,40 +34,41 @@ def check(latest: dict[str, Any], reference: dict[str, Any] | None, revision: st
     """Refuse what must not be published.
 
     Raises:
-        PublishError: for a run at smoke scale, with uncommitted code, of another revision than the one checked out, or with
-            fewer seeds than the published one.
+        PublishError: for a run at smoke scale, with uncommitted code, of other code than that checked out, or with fewer
+            seeds than the published one. A stage may be of an earlier commit if no code behind it has changed since.
     """
     if latest["scale"] != "paper":
         raise PublishError(f"reports/latest was run at {latest['scale']} scale; only paper scale is published")
-    revisions = {latest["revision"], *latest["revisions_of_stages"], revision}
-    if len(revisions) > 1 or not revision.isalnum() or revision == "unknown":
-        raise PublishError(
-            f"run and code must be one commit, found {', '.join(sorted(revisions))}; commit, run make reports again, then publish"
-        )
+    committed = all(name.isalnum() and name != "unknown" for name in (revision, *latest["revisions_of_stages"]))
+    if latest["revision"] != revision or not committed:
+        found = ", ".join(sorted({latest["revision"], *latest["revisions_of_stages"], revision}))
+        raise PublishError(f"run and code must be committed alike, found {found}; commit, run make reports again, then publish")
+    if latest["notebooks_changed_since"]:
+        raise PublishError(f"the code behind {', '.join(latest['notebooks_changed_since'])} has changed; run make reports again")
     if reference is not None and len(latest["seeds"]) < len(reference["seeds"]):
         raise PublishError(f"the run has {len(latest['seeds'])} seeds, the published one {len(reference['seeds'])}")
 
 
-def glance(comparison: pd.DataFrame, gaps: pd.DataFrame) -> str:
-    """README's comparison at a glance, as Markdown, from comparison.csv and tables/gaps.csv: one row a case study."""
+def glance(gaps: pd.DataFrame) -> str:
+    """README's comparison at a glance, as Markdown, from tables/gaps.csv: one row a case study."""
     rows = []
-    ours = gaps.set_index("case")["feature_gap"]
-    for case, numbers in comparison.groupby("case"):
-        by_row = {row: group.set_index("feature") for row, group in numbers.groupby("row")}
-        expert, policy = by_row["expert"], by_row["policy"]
-        error = (expert["reproduced"] / expert["published"] - 1).abs().mean()
-        printed = (policy["published"] / expert["published"] - 1).abs().mean()
-        rows.append(
-            {
-                "case study": "I" * int(case),
-                "expert error": f"{100 * error:.1f} %",
-                "feature gap, paper": f"{100 * printed:.1f} %",
-                "feature gap, ours": f"{100 * ours[case]:.1f} %",
-            }
-        )
-    n_seeds = int(comparison["n_seeds"].min())
-    seeds = "one seed" if n_seeds == 1 else f"medians over {n_seeds} seeds"
+    for numbers in gaps.to_dict("records"):
+        row = {"case study": ROMAN[int(numbers["case"]) - 1]}
+        row["expert error"] = _percent(numbers, "expert_error")
+        row["feature gap, paper"] = _percent(numbers, "published_gap")
+        row["feature gap, ours"] = _percent(numbers, "feature_gap")
+        row["online objective, share of minimum variance"] = _percent(numbers, "online_share")
+        rows.append(row)
+    n_seeds = int(gaps["n_seeds"].min())
+    intervals = " and 95 % bootstrap intervals of the median" if gaps["feature_gap_low"].notna().all() else ""
+    seeds = "one seed" if n_seeds == 1 else f"medians{intervals} over {n_seeds} seeds"
     return f"{pd.DataFrame(rows).to_markdown(index=False)}\n\n(ours: {seeds})"
+
+
+def _percent(numbers: Mapping[Any, Any], name: str) -> str:
+    """A share in per cent, with the ends of its interval where it has one."""
+    median, low, high = (100 * numbers.get(f"{name}{end}", float("nan")) for end in ("", "_low", "_high"))
+    return spread({"median": median, "ci_low": low, "ci_high": high}, decimals=1, unit=" %")
 
 
 def time_by_stage(time: pd.DataFrame) -> str:
@@ -96,7 +99,7 @@ def main() -> int:
         text = fill(
             readme.read_text(encoding="utf-8"),
             "glance",
-            glance(pd.read_csv(LATEST / "comparison.csv"), pd.read_csv(LATEST / "tables/gaps.csv")),
+            glance(pd.read_csv(LATEST / "tables/gaps.csv")),
         )
         text = fill(text, "time", time_by_stage(pd.read_csv(LATEST / "tables/time.csv")))
     except PublishError as error:

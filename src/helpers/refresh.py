@@ -10,8 +10,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from helpers.request import PROJECT
 from helpers.run import NOTEBOOKS, execute
+from helpers.sources import PROJECT
 
 INPUTS = NOTEBOOKS / "inputs"
 

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from helpers.features import FeatureMap, accumulated_error, discounts, normalised_error
 from helpers.lstm import Tape
+from helpers.natural import precondition
 from helpers.params import LearnerParams
-from helpers.policy import LSTMPolicy, PolicyController
+from helpers.policy import LSTMPolicy, PolicyController, entropy, log_density
 from helpers.process import Process
 from helpers.rollout import rollout
 from helpers.trajectories import Trajectories
@@ -147,7 +148,9 @@ class Learner:
         self.n_episodes = n_episodes
         self.total_epochs = total_epochs
         self.generator = generator
-        self.optimiser = torch.optim.Adam(policy.parameters(), lr=params.learning_rate_start)
+        # With the natural gradient, the learning rate is the share of the trust region that a step takes.
+        kind = torch.optim.Adam if params.trust_region is None else torch.optim.SGD
+        self.optimiser = kind(policy.parameters(), lr=params.learning_rate_start)
         self.epochs = self.episodes = self.gradient_steps = 0
         self._tapes: list[Tape] = []
 
@@ -188,38 +191,45 @@ class Learner:
         )
 
     def _ascend(self, batch: Trajectories, advantage: Tensor) -> None:
-        """Gradient steps on one batch, minibatch by minibatch.
+        """Gradient steps on one batch, minibatch by minibatch, in one pass or more.
 
-        With one minibatch this is the plain policy gradient; with more, every step after the first meets a batch that an
-        older policy drew, and the clipped ratio corrects for it.
+        A single step is the plain policy gradient; with more, every step after the first meets a batch that an older
+        policy drew, and the clipped ratio corrects for it.
         """
         params = self.params
+        n_steps = params.passes * params.minibatches
         drawn = None
-        if params.minibatches > 1:
+        if n_steps > 1:
             with torch.no_grad():
-                drawn = self._log_probability(batch, slice(None), self._tapes)
-        for part in range(params.minibatches):
-            rows = range(self.n_episodes)[part :: params.minibatches]
-            tapes = self._tapes if part == 0 else []
+                drawn = log_density(batch.command, *self._distribution(batch, slice(None), self._tapes))
+        for step in range(n_steps):
+            rows = range(self.n_episodes)[step % params.minibatches :: params.minibatches]
+            tapes = self._tapes if step == 0 else []  # later on they are those of an older policy
             self.optimiser.zero_grad()
             for first in range(0, len(rows), BLOCK):
                 block = rows[first : first + BLOCK]
                 index = slice(block.start, block.stop, block.step)
-                log_probability = self._log_probability(batch, index, tapes)
+                mean, std = self._distribution(batch, index, tapes)
+                log_probability = log_density(batch.command[:, index], mean, std)
                 if drawn is None:
                     gain = surrogate(log_probability, advantage[:, index])
                 else:
                     gain = clipped_surrogate(log_probability, drawn[:, index], advantage[:, index], params.ratio_clip)
+                if params.entropy:
+                    gain = gain + params.entropy * entropy(std, self.features.task).sum(0).mean()
                 (-gain * len(block) / len(rows)).backward()
             self._check_gradient()
+            if params.trust_region is not None:
+                precondition(self.policy, batch, self.features.task, params.trust_region)
             self.optimiser.step()
             self.gradient_steps += 1
 
-    def _log_probability(self, batch: Trajectories, rows: slice, tapes: list[Tape]) -> Tensor:
+    def _distribution(self, batch: Trajectories, rows: slice, tapes: list[Tape]) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the present policy along some episodes."""
         task = self.features.task
         every = rows == slice(None) or len(range(self.n_episodes)[rows]) == self.n_episodes
         chosen = tapes if every else [tape.rows(rows) for tape in tapes]
-        return self.policy.log_probability(batch.y[:, rows], batch.u[:, rows], batch.command[:, rows], task, chosen)
+        return self.policy.unrolled(batch.y[:, rows], batch.u[:, rows], task, chosen)
 
     def _check_gradient(self) -> None:
         rate = self.optimiser.param_groups[0]["lr"]

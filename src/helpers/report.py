@@ -1,12 +1,11 @@
-"""The report: collect what the stages wrote, set it beside the paper, draw and typeset. It computes no result."""
+"""The report: what the stages wrote set beside the paper, drawn and typeset. It computes no result."""
 
 import itertools
 import json
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,107 +14,20 @@ import pypandoc
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from helpers import drawings, figures, tables
-from helpers.artifacts import ArtifactError, Stage, code_revision, load_stage, versions
-from helpers.features import feature_names
-from helpers.params import OnlineParams, Params, PublishedCase, load, load_published
-from helpers.request import PROJECT
+from helpers import drawings, figures, scorecard, statistics, tables
+from helpers.artifacts import ArtifactError, code_revision, versions
+from helpers.collection import ONLINE, Results
+from helpers.params import OnlineParams
 from helpers.session import parameters_hash
+from helpers.sources import PROJECT, fingerprint
 
 TEMPLATE = PROJECT / "reports/template"
 BENCHMARKS = PROJECT / "reports/reference/benchmarks"  # of make bench, a run of its own
-DEMONSTRATIONS, ONLINE = "demonstrations", "online_improved"
-OFFLINE = {"offline": "improved", "offline_printed": "printed"}  # stage in seeds.csv and the variant behind it
-SCRATCH = "offline_improved"  # of a case that starts from another: the same learning without the transfer
-MADE_BY = {"demonstrations": "01", "offline": "02", "online": "03 (04 for the transfer case)", "transfer": "04"}
-LEARNING = {"offline": "improved", "offline_printed": "printed", "offline_scratch": "improved, from scratch"}
-CONTROLLERS = {
-    "expert_paired": "PID",
-    "offline": "offline policy",
-    "online": "online policy",
-    "online_y": "online policy, learned on y",
-}
-
-
-@dataclass(frozen=True)
-class Results:
-    """What the stages of all cases and seeds wrote.
-
-    Attributes:
-        params, published: by case.
-        stages: by case, seed and folder name.
-        seeds: columns case, seed, stage, metric, value. The stages: expert; offline, online and online_y of the headline
-            variant (offline of a transfer case is after the transfer); offline_printed; offline_scratch (the transfer
-            case learned from nothing).
-    """
-
-    scale: str
-    params: dict[int, Params]
-    published: dict[int, PublishedCase]
-    stages: dict[tuple[int, int, str], Stage]
-    seeds: pd.DataFrame
-
-    @cached_property
-    def feature_names(self) -> list[str]:
-        """Names of the features in their order."""
-        return feature_names(next(iter(self.params.values())).process.controlled)
-
-    def offline_folder(self, case: int, variant: str = "improved") -> str:
-        """The folder of a case's offline learning."""
-        return _offline_folder(self.params[case], variant)
-
-    def table(self, case: int, folder: str, name: str, seed: int = 0) -> pd.DataFrame:
-        """One table of one stage."""
-        return self.stages[case, seed, folder].table(name)
-
-    def score(self, case: int, folder: str, stage: str, metric: str, seed: int = 0) -> float:
-        """One figure of merit of one stage."""
-        rows = self.table(case, folder, "scores.csv", seed).set_index(["stage", "metric"])
-        return float(rows.loc[(stage, metric), "value"])
-
-    def medians(self, stage: str) -> pd.DataFrame:
-        """The median over seeds of every metric of a stage: a row for each metric, a column for each case."""
-        rows = self.seeds[self.seeds["stage"] == stage]
-        return rows.pivot_table(index="metric", columns="case", values="value", aggfunc="median")
-
-
-def _offline_folder(params: Params, variant: str) -> str:
-    return f"offline_{variant}" if params.case.offline.transfer_from is None else f"transfer_{variant}"
-
-
-def collect(root: Path, params_root: Path, scale: str, cases: tuple[int, ...], n_seeds: int) -> Results:
-    """Read every stage of every case and seed below `root`.
-
-    Raises:
-        ArtifactError: if a stage is missing, damaged or was made with other parameters than the files now hold.
-    """
-    params = {case: load(params_root, case) for case in cases}
-    published = load_published(params_root)
-    stages: dict[tuple[int, int, str], Stage] = {}
-    frames = []
-    for case, record in params.items():
-        folders = {DEMONSTRATIONS: {"expert": "expert"}, ONLINE: {name: name for name in ("expert_paired", "online", "online_y")}}
-        folders |= {_offline_folder(record, variant): {"offline": name} for name, variant in OFFLINE.items()}
-        if record.case.offline.transfer_from is not None:
-            folders[SCRATCH] = {"offline": "offline_scratch"}
-        for seed in range(n_seeds):
-            for folder, names in folders.items():
-                notebook = MADE_BY[folder.split("_")[0]]
-                path = root / scale / f"seed_{seed}" / f"case_{case}" / folder
-                stage = load_stage(path, f"notebook {notebook} for case {case} and seed {seed}")
-                if stage.record.get("parameters") != parameters_hash(record):
-                    raise ArtifactError(
-                        f"{path / 'record.json'}: made with other parameters than {params_root} holds now; run it again"
-                    )
-                stages[case, seed, folder] = stage
-                scores = stage.table("scores.csv", ("stage", "metric", "value"))
-                frames.append(scores.assign(case=case, seed=seed, stage=scores["stage"].map(names)))
-    seeds = pd.concat(frames, ignore_index=True)[["case", "seed", "stage", "metric", "value"]]
-    return Results(scale, params, {case: published[case] for case in cases}, stages, seeds)
+OF_THE_PAPER = {"control_case_1": 3, "tracking_case_2": 4, "control_case_2": 5, "control_case_3": 6}  # numbers of its figures
 
 
 def draw(results: Results) -> dict[str, Figure]:
-    """All figures of the report by name, from the first seed."""
+    """All figures of the report by name, each over all seeds."""
     first = next(iter(results.params.values()))
     policy, process = first.learning.policy, first.process
     descriptions = dict(zip(process.controlled, process.controlled_description, strict=True))
@@ -136,18 +48,24 @@ def draw(results: Results) -> dict[str, Figure]:
         )
         response = results.table(case, offline, "response.csv")
         drawn[f"tracking_case_{case}"] = figures.tracking_figure(response, process.controlled, target, descriptions)
-        chosen = int(results.score(case, offline, "offline", "chosen_epoch"))
+        chosen = round(results.median(case, "offline", "chosen_epoch"))
+        words = "policy taken from here" + (" (median)" if results.n_seeds > 1 else "")
         drawn[f"learning_curves_case_{case}"] = figures.learning_curves(
             results.table(case, offline, "history.csv"),
-            marks={chosen: "policy taken from here"},
+            marks={chosen: words},
             gap_levels={"the paper's own gap": results.published[case].feature_gap},
         )
         history = results.table(case, ONLINE, "history.csv")
-        drawn[f"online_curves_case_{case}"] = figures.learning_curves(history, marks=_rounds(params.case.online, len(history)))
-    for number, name in (("3", "control_case_1"), ("4", "tracking_case_2"), ("5", "control_case_2"), ("6", "control_case_3")):
-        if name in drawn:
-            drawn[f"figure_{number}"] = drawn.pop(name)
-    return drawn
+        marks = _rounds(params.case.online, history["epochs"].nunique())
+        drawn[f"online_curves_case_{case}"] = figures.learning_curves(history, marks=marks)
+    if len(results.budget):
+        stages = {tables.CONTROLLERS[name]: name for name in ("expert_paired", "offline", scorecard.MINIMUM_VARIANCE)}
+        levels = {}
+        for case in results.params:
+            levels[case] = {label: results.median(case, stage, "objective_x") for label, stage in stages.items()}
+        titles = {case: f"Case Study {tables.ROMAN[case - 1]}" for case in results.params}
+        drawn["online_budget"] = figures.budget_figure(results.budget, levels, titles)
+    return {f"figure_{OF_THE_PAPER[name]}" if name in OF_THE_PAPER else name: figure for name, figure in drawn.items()}
 
 
 def _rounds(online: OnlineParams, n_epochs: int) -> dict[int, str]:
@@ -161,51 +79,40 @@ def _rounds(online: OnlineParams, n_epochs: int) -> dict[int, str]:
 
 def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     """All tables of the report by name."""
-    names = results.feature_names
+    names, medians = results.feature_names, results.medians
     process = next(iter(results.params.values())).process
-    expert, offline = results.medians("expert"), results.medians("offline")
-    tabulated = {"table_1": tables.table_1({case: params.case for case, params in results.params.items()}, process)}
+    scale = next(iter(results.params.values())).learning.scales[results.scale]
+    trajectories = {"expert": scale.expert_evaluation, "policy": scale.evaluation}
+    compared = scorecard.comparison(results.published, results.seeds, medians, names, trajectories)
+    tabulated = {
+        "table_1": tables.table_1({case: params.case for case, params in results.params.items()}, process),
+        "gaps": scorecard.gaps(medians, results.published),
+        "comparison": compared,
+        "verdicts": scorecard.counts(compared),
+        "summary": medians,
+        "variants": tables.variants_table(medians),
+    }
     for case, published in results.published.items():
-        ours = {
-            row: {name: frame.loc[f"{kind}:{name}", case] for name in names}
-            for row, frame, kind in (("expert", expert, "v"), ("policy", offline, "v"), ("alpha", offline, "alpha"))
-        }
-        tabulated[f"table_{published.table}"] = tables.results_table(published, **ours, feature_names=names)
-    gaps = tables.gaps(results.seeds, results.published, names)
-    tabulated["gaps"] = gaps
-    tabulated["comparison"] = tables.comparison(results.published, results.seeds, names)
-    costs = []
-    for stage, label in LEARNING.items():
-        medians = results.medians(stage)
-        for case in medians.columns:
-            column = medians[case]
-            costs.append({"case": case, "learning": label, "feature gap, %": 100 * column["feature_gap"]})
-            costs[-1] |= {
-                name.replace("_", " "): int(column[name]) for name in ("epochs", "chosen_epoch", "episodes", "gradient_steps")
-            }
-    tabulated["variants"] = pd.DataFrame(costs).sort_values(["case", "learning"], ignore_index=True)
-    rows = []
-    for case in results.params:
-        for stage, label in CONTROLLERS.items():
-            column = results.medians(stage)[case]
-            row = {
-                "case": case,
-                "controller": label,
-                "J on x": column["objective_x"],
-                "J on y": column["objective_y"],
-            }
-            row |= {f"overshoot {tables.symbol(name)}, %": 100 * column[f"overshoot:{name}"] for name in process.controlled}
-            row |= {f"offset {tables.symbol(name)}, %": 100 * column[f"offset:{name}"] for name in process.controlled}
-            row |= {f"movement {tables.symbol(name)}": column[f"movement:{name}"] for name in process.manipulated}
-            rows.append(row | {"episodes": column.get("episodes")})
-    tabulated["control_quality"] = pd.DataFrame(rows)
+        tabulated[f"table_{published.table}"] = tables.results_table(compared[compared["case"] == case], names)
+    quality = {case: tables.quality_table(medians[medians["case"] == case], process) for case in results.params}
+    tabulated["control_quality"] = pd.concat(quality, names=["case"]).reset_index("case").reset_index(drop=True)
     leaves = [leaf for params in results.params.values() for leaf in params.leaves]
     tabulated["parameters"] = tables.parameters_table(leaves)
     seconds = [
         {"case": case, "stage": folder, "seconds": stage.record["seconds"]} for (case, _, folder), stage in results.stages.items()
     ]
     tabulated["time"] = pd.DataFrame(seconds).groupby(["case", "stage"], as_index=False)["seconds"].median()
+    if len(results.claims):
+        tabulated["claims"] = results.claims
+    if len(results.trials):
+        tabulated["trials"] = tables.trials_table(results.trials)
     return tabulated
+
+
+def changed_since(records: list[dict[str, Any]]) -> list[str]:
+    """The notebooks whose code, or that of a module behind them, is no longer what made a stage."""
+    found = {(record["notebook"], record.get("code")) for record in records}
+    return sorted({notebook for notebook, code in found if code != fingerprint(notebook)})
 
 
 def provenance(results: Results) -> dict[str, Any]:
@@ -216,6 +123,7 @@ def provenance(results: Results) -> dict[str, Any]:
         "seeds": sorted({seed for _, seed, _ in results.stages}),
         "revision": code_revision(PROJECT),
         "revisions_of_stages": sorted({record["revision"] for record in records}),
+        "notebooks_changed_since": changed_since(records),
         "versions": versions(),
         "parameters": {str(case): parameters_hash(params) for case, params in results.params.items()},
         "stage_seconds": sum(record["seconds"] for record in records),
@@ -264,23 +172,54 @@ def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapp
     """The report as Markdown, from its template; every number in its prose comes from the results."""
     environment = Environment(loader=FileSystemLoader(TEMPLATE), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters["percent"] = lambda share: f"{100 * share:.1f} %"
+    environment.filters["numeral"] = lambda case: tables.ROMAN[case - 1]
     environment.filters["table"] = tables.to_markdown
-    environment.filters["rounded_table"] = partial(tables.to_markdown, digits=3)
-    environment.filters["results_table"] = partial(tables.to_markdown, decimals=tables.RESULT_DECIMALS)
-    medians = {stage: results.medians(stage).to_dict() for stage in results.seeds["stage"].unique()}
+    environment.filters["claims_table"] = tables.claims_table
+    numbers = results.medians.set_index(scorecard.KEYS)[["median", "ci_low", "ci_high"]]
+
+    def number(case: int, stage: str, metric: str, factor: float = 1, **style: Any) -> str:
+        """A median with its interval."""
+        return tables.spread(factor * numbers.reindex([(case, stage, metric)]).iloc[0], **style)
+
     parts = ("summary", "machine")
     benchmarks = {part: (BENCHMARKS / f"{part}.md").read_text(encoding="utf-8") for part in parts if BENCHMARKS.is_dir()}
-    gaps = tabulated["gaps"].set_index("case").to_dict("index")
     return environment.get_template("report.md.jinja").render(
         results=results,
         tables=tabulated,
+        compared=tabulated["comparison"],
         origin=origin,
-        medians=medians,
-        gaps=gaps,
+        number=number,
+        gaps=tabulated["gaps"].set_index("case").to_dict("index"),
         cases=results.params,
         published=results.published,
         benchmarks=benchmarks,
+        claims=scorecard.verdicts_of_claims(results.claims),
+        listing=partial(scorecard.listing, tabulated["comparison"]),
+        better=_better(results),
+        nearer=scorecard.nearer_to_expert(tabulated["comparison"]),
+        settings=partial(_settings, tabulated["parameters"]),
+        level=statistics.LEVEL,
+        fewest=statistics.FEWEST,
+        trajectories=scorecard.PUBLISHED_TRAJECTORIES,
+        widest=scorecard.WIDEST,
     )
+
+
+def _settings(parameters: pd.DataFrame, status: str, part: int) -> str:
+    """The settings of a status by file, each by one part of its key; those of the cases together."""
+    found = parameters[parameters["status"] == status]
+    files = found["file"].str.removesuffix(".yaml").str.replace(r"case_\d+", "cases", regex=True)
+    keys = found["key"].str.split(".").str[part].str.replace("_", " ")
+    return "; ".join(f"*{file}* ({', '.join(of_file.unique())})" for file, of_file in keys.groupby(files))
+
+
+def _better(results: Results) -> dict[str, list[int]]:
+    """The cases in which ours is better beyond its interval: the gap below the paper's, online J above the PID's."""
+    numbers = results.medians.set_index(scorecard.KEYS)
+    low, high = (numbers[end].fillna(numbers["median"]) for end in ("ci_low", "ci_high"))
+    gap = [case for case, paper in results.published.items() if high[case, "offline", "feature_gap"] < paper.feature_gap]
+    online = [case for case in results.params if low[case, "online", "objective_x"] > high[case, "expert_paired", "objective_x"]]
+    return {"gap": gap, "online": online}
 
 
 def typeset(text: str, folder: Path) -> None:
@@ -295,7 +234,8 @@ def typeset(text: str, folder: Path) -> None:
             "--mathml",
             "--embed-resources",
             "--toc",
-            "--toc-depth=2",
+            "--toc-depth=1",
+            "--columns=10000",  # otherwise a long line in the source of a table fixes the widths of its columns
             f"--resource-path={folder}",
             f"--css={TEMPLATE / 'report.css'}",
         ],

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from helpers.params import InputError, Params, load
+from helpers.sources import PROJECT, notebook_path
 
-PROJECT = Path(__file__).resolve().parents[2]
 NOTEBOOK_PARAMETERS = {
     "case": int,
     "seed": int,
@@ -27,7 +27,7 @@ class SessionError(InputError):
 
 def parameter_names(notebook: str) -> list[str]:
     """The names in a notebook's own parameters cell: not every notebook takes every parameter."""
-    cells = json.loads((PROJECT / f"notebooks/{notebook}.ipynb").read_text(encoding="utf-8"))["cells"]
+    cells = json.loads(notebook_path(notebook).read_text(encoding="utf-8"))["cells"]
     source = next("".join(cell["source"]) for cell in cells if "parameters" in cell["metadata"].get("tags", []))
     return [
         node.targets[0].id
@@ -55,7 +55,11 @@ def check_parameters(notebook: str, given: Mapping[str, Any]) -> Params:
         if given.get(name, least) < least:
             raise SessionError(f"{where}: parameter '{name}': expected {least} or more, found {given[name]}")
     params = load(Path(given.get("params_root") or PROJECT / "params").resolve(), given.get("case", 1))
-    for name, known in (("scale", params.learning.scales), ("variant", params.learning.variants)):
+    variants = [name for name in params.learning.variants if name not in params.trials]
+    for name, known, shown in (
+        ("scale", params.learning.scales, list(params.learning.scales)),
+        ("variant", params.learning.variants, [*variants, "a trial of params/trials.yaml"] if params.trials else variants),
+    ):
         if name in given and given[name] not in known:
-            raise SessionError(f"{where}: parameter '{name}': expected one of {', '.join(known)}, found '{given[name]}'")
+            raise SessionError(f"{where}: parameter '{name}': expected one of {', '.join(shown)}, found '{given[name]}'")
     return params

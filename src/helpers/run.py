@@ -9,6 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+# nbformat's validator would build a grammar of international web addresses, two thirds of this program's start, for a check
+# that no notebook asks for. It is optional: where the package is not to be had, that check is left out.
+sys.modules.setdefault("rfc3987_syntax", None)  # type: ignore[arg-type]
+
 import nbformat
 import papermill
 from nbclient.exceptions import DeadKernelError
@@ -16,7 +20,8 @@ from papermill.exceptions import PapermillExecutionError
 from traitlets.config import Config
 
 from helpers.params import ParameterError
-from helpers.request import PROJECT, SessionError, check_parameters
+from helpers.request import SessionError, check_parameters
+from helpers.sources import PROJECT, notebook_path
 
 NOTEBOOKS = PROJECT / "notebooks"
 
@@ -28,7 +33,7 @@ def execute(notebook: str, output: Path, parameters: dict[str, Any]) -> None:
         ParameterError, SessionError: if the parameters cannot be used; nothing was run then.
         PapermillExecutionError: if a cell failed; its traceback stands in the executed copy.
     """
-    source = NOTEBOOKS / f"{notebook}.ipynb"
+    source = notebook_path(notebook)
     if not source.is_file():
         known = ", ".join(sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb")))
         raise SessionError(f"{source}: there is no such notebook; the notebooks are {known}")

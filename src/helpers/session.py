@@ -3,7 +3,7 @@
 import hashlib
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -12,15 +12,29 @@ from typing import Any
 import pandas as pd
 import torch
 from IPython.display import Markdown
+from matplotlib.figure import Figure
 
 from helpers import artifacts
-from helpers.controllers import PID
+from helpers.controllers import PID, MinimumVariance
 from helpers.features import FeatureMap, feature_names
-from helpers.params import Params, PublishedCase, ScaleParams, VariantParams, load_published
+from helpers.params import (
+    IdentificationParams,
+    IdentificationScaleParams,
+    Params,
+    PublishedCase,
+    ScaleParams,
+    VariantParams,
+    list_leaves,
+    load,
+    load_identification,
+    load_published,
+    read_yaml,
+)
 from helpers.policy import LSTMPolicy
 from helpers.process import LinearProcess
 from helpers.randomness import stream
-from helpers.request import NOTEBOOK_PARAMETERS, PROJECT, SessionError, check_parameters, parameter_names
+from helpers.request import NOTEBOOK_PARAMETERS, SessionError, check_parameters, parameter_names
+from helpers.sources import PROJECT, fingerprint
 from helpers.task import ControlTask
 
 PLAIN = (str, int, float, list, dict, type(None))
@@ -84,6 +98,11 @@ class Session:
         """The demonstrating controller of this case."""
         return PID(self.params.demonstrator, self.task.set_point, self.params.process.sampling_time)
 
+    @cached_property
+    def minimum_variance(self) -> MinimumVariance:
+        """The reference for what is attainable in this case: it knows the process and acts on the observation."""
+        return MinimumVariance(self.process.state_step, self.process.input_step, self.task.set_point)
+
     @property
     def feature_names(self) -> list[str]:
         """Names of the features in their order."""
@@ -116,6 +135,7 @@ class Session:
             "parameters": parameters_hash(self.params),
             "seconds": time.perf_counter() - self.started,
             "revision": artifacts.code_revision(PROJECT),
+            "code": fingerprint(self.notebook),
             "versions": artifacts.versions(),
         }
         return artifacts.save_stage(self.folder(self.output_root, stage), record, tables, policy)
@@ -140,7 +160,12 @@ class Session:
 
 def parameters_hash(params: Params) -> str:
     """A hash of every parameter that a case was run with."""
-    content = json.dumps([[leaf["file"], leaf["key"], leaf["value"]] for leaf in params.leaves], sort_keys=True)
+    return leaves_hash(params.leaves)
+
+
+def leaves_hash(leaves: Iterable[Mapping[str, Any]]) -> str:
+    """A hash of the values of leaves."""
+    content = json.dumps([[leaf["file"], leaf["key"], leaf["value"]] for leaf in leaves], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()
 
 
@@ -164,6 +189,60 @@ class ReportSession:
             "**This is the smoke run on the small committed results of notebooks 01 to 04: its numbers mean nothing.** "
             f"The full run's report is [{report}](../{report})."
         )
+
+
+@dataclass(frozen=True)
+class IdentificationSession:
+    """One run of the notebook that infers settings from the expert rows of all cases that the paper printed.
+
+    `params` holds the parameters of each case and `leaves` those of all files read.
+    """
+
+    notebook: str
+    seed: int
+    scale: str
+    output_root: Path
+    params: Mapping[int, Params]
+    published: Mapping[int, PublishedCase]
+    identification: IdentificationParams
+    leaves: tuple[dict[str, Any], ...]
+    started: float = field(default_factory=time.perf_counter)
+
+    @property
+    def scale_params(self) -> IdentificationScaleParams:
+        """How much this scale computes."""
+        return self.identification.scales[self.scale]
+
+    def save(self, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, Figure]) -> artifacts.Stage:
+        """Write the results with a record of where they come from; they belong to a seed and to no case."""
+        record = {
+            "notebook": self.notebook,
+            "seed": self.seed,
+            "scale": self.scale,
+            "parameters": leaves_hash(self.leaves),
+            "seconds": time.perf_counter() - self.started,
+            "revision": artifacts.code_revision(PROJECT),
+            "code": fingerprint(self.notebook),
+            "versions": artifacts.versions(),
+        }
+        folder = self.output_root / self.scale / f"seed_{self.seed}" / "inferred_settings"
+        return artifacts.save_stage(folder, record, tables, figures=figures)
+
+    def banner(self) -> Markdown:
+        """What kind of run this is, for the top of the notebook."""
+        if self.scale != "smoke":
+            return Markdown(f"**Expert rows of Tables 2 to 4, seed {self.seed}, scale `{self.scale}`.**")
+        copy = f"reports/reference/notebooks/{self.notebook}.ipynb"
+        return Markdown(
+            "**This is the smoke run: a few seconds, few evaluations, results without meaning.** "
+            f"The full run's executed copy is [{copy}](../{copy})."
+        )
+
+    def settings(self) -> pd.DataFrame:
+        """What the notebook was run with."""
+        scale = {f"scale.{key}": value for key, value in self.scale_params.model_dump().items()}
+        given = {"seed": self.seed, "scale": self.scale}
+        return pd.DataFrame([{"setting": key, "value": str(value)} for key, value in (given | scale).items()])
 
 
 def _given(notebook: str, namespace: dict[str, Any]) -> tuple[dict[str, Any], Params]:
@@ -236,4 +315,24 @@ def open_report(notebook: str, namespace: dict[str, Any]) -> ReportSession:
         input_root=_root(given, "input_root", _inputs(given["scale"])),
         output_root=_root(given, "output_root", "results/smoke/report" if given["scale"] == "smoke" else "reports/latest"),
         params_root=params_root,
+    )
+
+
+def open_identification(notebook: str, namespace: dict[str, Any]) -> IdentificationSession:
+    """`open_session` for the notebook that infers settings, which reads the cases that the paper printed."""
+    given, first = _given(notebook, namespace)
+    params_root = _root(given, "params_root", "params")
+    published = load_published(params_root)
+    params = {case: load(params_root, case) for case in sorted(published)}
+    own = list_leaves(read_yaml(params_root / "identification.yaml"), "identification.yaml")
+    torch.set_num_threads(first.learning.scales[given["scale"]].threads)
+    return IdentificationSession(
+        notebook=notebook,
+        seed=given["seed"],
+        scale=given["scale"],
+        output_root=_root(given, "output_root", "results"),
+        params=params,
+        published=published,
+        identification=load_identification(params_root, first),
+        leaves=(*(leaf for record in params.values() for leaf in record.leaves), *own),
     )

@@ -73,8 +73,8 @@ def imitate(session: Session, demonstrations: Demonstrations, policy: LSTMPolicy
     n_iterations = n_epochs if variant.weights.iterations == "epochs" else min(offline.iterations, n_epochs)
     if start is None:
         start = initial_weights(variant.weights, len(session.task.set_point), session.dtype)
-    policy.reset_exploration()
-    generator = session.stream("offline", session.variant)
+    policy.reset_exploration(variant.exploration)
+    generator = session.stream("offline", session.params.base(session.variant))
     learner = Learner(policy, session.process, session.features, variant.learner, scale.episodes, n_epochs, generator)
     return maxent_irl(
         learner,
@@ -95,14 +95,17 @@ class Improvement:
     records: tuple[EpochRecord, ...]
 
 
-def improve(session: Session, policy: LSTMPolicy, features_on: str) -> Improvement:
-    """Online learning: the case's rounds of Algorithm 1 under the tracking objective, read from x or from y."""
+def improve(session: Session, policy: LSTMPolicy, features_on: str, episodes: int | None = None) -> Improvement:
+    """Online learning: the case's rounds of Algorithm 1 under the tracking objective, read from x or from y.
+
+    `episodes` an epoch, each a run of the plant, are those of the parameter files unless given.
+    """
     online, learning = session.params.case.online, session.params.learning.online
     epochs = [session.epochs(n_epochs) for n_epochs in online.epochs]
     generator = session.stream("online", session.variant, features_on)
     scale = session.scale_params
-    n_episodes = min(learning.episodes, scale.episodes + scale.measured)
-    policy.reset_exploration()
+    n_episodes = min(episodes or learning.episodes, scale.episodes + scale.measured)
+    policy.reset_exploration(learning.exploration)
     learner = Learner(
         policy, session.process, session.features.on(features_on), learning.learner, n_episodes, sum(epochs), generator
     )

@@ -1,4 +1,4 @@
-"""Tables 1-4, the comparison with the paper and the list of parameters, as frames and as Markdown for the report."""
+"""What the report shows as tables: Tables 1-4, control quality, variants, claims, trials and parameters, also as Markdown."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -7,21 +7,29 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from helpers.params import CaseParams, ProcessParams, PublishedCase
+from helpers.params import CaseParams, ProcessParams
 
 ROMAN = ("I", "II", "III", "IV", "V", "VI", "VII", "VIII", "IX", "X")
 QUANTITIES = {"expert": "E[v^E]", "policy": "E[v^pi]", "alpha": "alpha*"}  # the rows of Tables 2-4, in their order
-RESULT_DECIMALS = (2, 2, 2, 2, 3, 3)  # of the rows of `results_table`, as the paper prints them
-REPRODUCED_BY = {"expert": ("expert", "v"), "policy": ("offline", "v"), "alpha": ("offline", "alpha")}  # stage, metric
-COMPARISON_COLUMNS = ["table", "case", "row", "feature", "published", "reproduced", "n_seeds"]
+RESULT_DECIMALS = {"expert": 2, "policy": 2, "alpha": 3}  # of each row, as the paper prints them
+CONTROLLERS = {
+    "expert_paired": "PID",
+    "offline": "offline policy",
+    "online": "online policy",
+    "online_y": "online policy, learned on y",
+    "minimum_variance": "minimum variance on y",
+}
+LEARNING = {"offline": "improved", "offline_printed": "printed", "offline_scratch": "improved, from scratch"}
+COSTS = ("epochs", "chosen_epoch", "episodes", "gradient_steps")
 TYPESET = {
     "E[v^E]": r"$\mathbb{E}[v^{\gamma,E}]$",
     "E[v^pi]": r"$\mathbb{E}[v^{\gamma,\pi}]$",
     "alpha*": r"$\alpha^*$",
 }
-FEATURE = re.compile(r"(\w+)-(I{1,3})")
-LOOP = re.compile(r"(.*)\((\w+)\) control loop")
 NOT_KNOWN = "–"
+FEATURE = re.compile(r"(\w+)-(I{1,3})")
+NUMBER = re.compile(rf"-?[\d.]+(e-?\d+)?( %)?( \[.*\]| \(.*\))?|{NOT_KNOWN}|inf")
+LOOP = re.compile(r"(.*)\((\w+)\) control loop")
 
 
 def symbol(name: str) -> str:
@@ -56,69 +64,119 @@ def table_1(cases: Mapping[int, CaseParams], process: ProcessParams) -> pd.DataF
     return pd.DataFrame(rows, columns=["case_study", "system_parameter", *loops])
 
 
-def results_table(
-    published: PublishedCase,
-    expert: Mapping[str, float] | pd.Series,
-    policy: Mapping[str, float] | pd.Series,
-    alpha: Mapping[str, float] | pd.Series,
-    feature_names: Sequence[str],
-) -> pd.DataFrame:
-    """Table 2, 3 or 4: each printed row and, below it, ours. Columns: quantity, source, then the features.
+def spread(numbers: Mapping[str, Any] | pd.Series, digits: int = 3, decimals: int | None = None, unit: str = "") -> str:
+    """A median with its interval as text: 16.8 [16.5, 17.0]; the median alone where there is no interval or no spread at all.
 
     Args:
-        expert, policy, alpha: our E[v^E], E[v^pi] and alpha*, by feature name.
+        numbers: median, ci_low and ci_high.
+        digits: significant digits of the greatest of them; `decimals`: instead, digits after the point.
+    """
+    values = [float(numbers[name]) for name in ("median", "ci_low", "ci_high")]
+    if np.isnan(values[0]):
+        return NOT_KNOWN
+    if decimals is None:
+        size = np.nanmax(np.abs(values))
+        decimals = max(0, digits - 1 - int(np.floor(np.log10(size)))) if size > 0 else 0
+    median, low, high = (_number(value, digits, decimals) for value in values)
+    bare = np.isnan(values[1:]).any() or values[1] == values[2]
+    return f"{median}{unit}" if bare else f"{median}{unit} [{low}, {high}]"
+
+
+def results_table(compared: pd.DataFrame, feature_names: Sequence[str]) -> pd.DataFrame:
+    """Table 2, 3 or 4 as text: each printed row and, below it, our median, its interval, that of one run, and the verdict.
+
+    Args:
+        compared: the rows of one case in the comparison with the paper.
     """
     rows = []
-    for row, ours in (("expert", expert), ("policy", policy), ("alpha", alpha)):
-        printed = dict(zip(feature_names, getattr(published, row), strict=True))
-        rows.append({"quantity": QUANTITIES[row], "source": "published", **printed})
-        rows.append({"quantity": QUANTITIES[row], "source": "reproduced", **{name: float(ours[name]) for name in feature_names}})
+    for row, decimals in RESULT_DECIMALS.items():
+        numbers = compared[compared["row"] == row].set_index("feature").loc[list(feature_names)]
+        shown = numbers.select_dtypes("number").map(lambda value, places=decimals: _cell(value, 4, places))
+        lines = {
+            "published": shown["published"],
+            "reproduced": shown["reproduced"],
+            "interval of median": (shown["ci_low"] + " to " + shown["ci_high"]).where(numbers["ci_low"].notna(), NOT_KNOWN),
+            "interval of one run": (shown["pred_low"] + " to " + shown["pred_high"]).where(numbers["pred_low"].notna(), NOT_KNOWN),
+            "verdict": numbers["verdict"],
+        }
+        rows += [{"quantity": QUANTITIES[row], "source": source, **line.to_dict()} for source, line in lines.items()]
     return pd.DataFrame(rows)
 
 
-def comparison(published: Mapping[int, PublishedCase], seeds: pd.DataFrame, feature_names: Sequence[str]) -> pd.DataFrame:
-    """One row for each published number of Tables 2-4, beside the median of ours over the seeds.
-
-    A number that no seed gave is nan with n_seeds 0.
+def quality_table(medians: pd.DataFrame, process: ProcessParams) -> pd.DataFrame:
+    """Control quality of one case as text, a row for each figure of merit and a column for each controller.
 
     Args:
-        seeds: columns case, seed, stage, metric, value.
+        medians: columns stage, metric, median, ci_low, ci_high, of one case.
     """
-    over_seeds = seeds.groupby(["case", "stage", "metric"])["value"].agg(["median", "count"])
+    labels: dict[str, tuple[str, int, int | None]] = {  # of each metric its label, factor and digits after the point
+        "objective_x": ("$J$ on $x$", 1, 2),
+        "share": ("$J$ on $x$, % of minimum variance", 100, 1),
+        "objective_y": ("$J$ on $y$", 1, 2),
+    }
+    for name in process.controlled:
+        labels |= {f"{what}:{name}": (f"{what} {symbol(name)}, %", 100, 1) for what in ("overshoot", "offset")}
+        labels[f"rise_time:{name}"] = (f"rise time {symbol(name)}, time", 1, 2)
+    labels |= {f"movement:{name}": (f"movement {symbol(name)}", 1, None) for name in process.manipulated}
+    labels["episodes"] = ("episodes spent", 1, 0)
+    values = medians.set_index(["metric", "stage"])[["median", "ci_low", "ci_high"]]
     rows = []
-    for case, printed in published.items():
-        for row, (stage, metric) in REPRODUCED_BY.items():
-            for feature, value in zip(feature_names, getattr(printed, row), strict=True):
-                key = (case, stage, f"{metric}:{feature}")
-                median, count = over_seeds.loc[key] if key in over_seeds.index else (np.nan, 0)
-                rows.append([printed.table, case, row, feature, value, float(median), int(count)])
-    return pd.DataFrame(rows, columns=COMPARISON_COLUMNS)
+    for metric, (label, factor, decimals) in labels.items():
+        row = {"figure of merit": label}
+        for stage, name in CONTROLLERS.items():
+            row[name] = spread(factor * values.reindex([(metric, stage)]).iloc[0], decimals=decimals)
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
-def gaps(seeds: pd.DataFrame, published: Mapping[int, PublishedCase], feature_names: Sequence[str]) -> pd.DataFrame:
-    """How near the learned policy comes to the expert, ours and the paper's, and how near our expert comes to the paper's.
+def variants_table(medians: pd.DataFrame) -> pd.DataFrame:
+    """Feature gap, in per cent, and cost of each way of offline learning: median, 95 % interval and the worst seed of the gap.
 
-    Columns: case; n_seeds; feature_gap, its median over the seeds, with the least and the greatest; published_gap, the
-    mean of |v_pi - v_E| / |v_E| over the paper's own rows; expert_error, the mean relative error of our expert row.
-    All but the first two are shares of one.
+    Args:
+        medians: columns case, stage, metric, n_seeds, median, ci_low, ci_high, greatest.
     """
-    compared = comparison(published, seeds, feature_names)
     rows = []
-    for case, printed in published.items():
-        ours = seeds.query("case == @case and stage == 'offline' and metric == 'feature_gap'")["value"]
-        row = compared.query("case == @case and row == 'expert'")
-        rows.append(
-            {
-                "case": case,
-                "n_seeds": int(ours.count()),
-                "feature_gap": ours.median(),
-                "feature_gap_least": ours.min(),
-                "feature_gap_greatest": ours.max(),
-                "published_gap": printed.feature_gap,
-                # A feature that is missing makes the mean nan instead of being left out of it.
-                "expert_error": ((row["reproduced"] - row["published"]).abs() / row["published"].abs()).mean(skipna=False),
-            }
-        )
+    for (case, stage), group in medians[medians["stage"].isin(LEARNING)].groupby(["case", "stage"]):
+        found = group.set_index("metric")
+        gap = 100 * found.loc["feature_gap", ["median", "ci_low", "ci_high", "greatest"]].astype(float)
+        row = {"case": case, "learning": LEARNING[stage], "n_seeds": found.loc["feature_gap", "n_seeds"]}
+        row |= {"feature gap, %": spread(gap, decimals=1), "worst seed, %": _number(gap["greatest"], 4, 1)}
+        rows.append(row | {name.replace("_", " "): int(found.loc[name, "median"]) for name in COSTS})
+    return pd.DataFrame(rows).sort_values(["case", "learning"], ignore_index=True)
+
+
+def trials_table(trials: pd.DataFrame) -> pd.DataFrame:
+    """What was tried offline, a row for each trial: what it changes and for each case the feature gap in per cent.
+
+    A cell holds the median over the seeds with the least and the greatest, and how many they are.
+
+    Args:
+        trials: columns trial, family, description, case, seed, gap (a share of one).
+    """
+    over_seeds = trials.groupby(["trial", "case"])["gap"].agg(["median", "min", "max", "count"])
+    rows = []
+    for trial in trials.drop_duplicates("trial").to_dict("records"):
+        row = {name: trial[name] for name in ("family", "trial", "description")}
+        for case in sorted(trials["case"].unique()):
+            middle, least, most, n_seeds = over_seeds.reindex([(trial["trial"], case)]).iloc[0]
+            shown = f"{100 * middle:.1f} ({100 * least:.1f} to {100 * most:.1f}; {n_seeds:.0f} seed{'s' * (n_seeds > 1)})"
+            row[f"case {ROMAN[case - 1]}, %"] = NOT_KNOWN if np.isnan(middle) else shown
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def claims_table(claims: pd.DataFrame) -> pd.DataFrame:
+    """The paper's checkable sentences with what the seeds say, as text; section and statement once for each claim.
+
+    Args:
+        claims: columns id, section, statement, case, quantity, n, median, ci_low, ci_high, test, verdict, reason.
+    """
+    again = claims["id"].duplicated()
+    rows = []
+    for repeated, claim in zip(again, claims.to_dict("records"), strict=True):
+        row = {name: "" if repeated else claim[name] for name in ("section", "statement")}
+        row |= {"case": ROMAN[claim["case"] - 1], "quantity": claim["quantity"], "median": spread(claim), "seeds": claim["n"]}
+        rows.append(row | {name: claim[name] for name in ("test", "verdict", "reason")})
     return pd.DataFrame(rows)
 
 
@@ -141,27 +199,18 @@ def render(value: Any) -> str:
     return f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
-def to_markdown(
-    frame: pd.DataFrame, digits: int = 4, decimals: Sequence[int] | None = None, labels: Mapping[str, str] | None = None
-) -> str:
-    """A pipe table for pandoc, without the index; numbers to the right.
+def to_markdown(frame: pd.DataFrame, digits: int = 4, labels: Mapping[str, str] | None = None) -> str:
+    """A pipe table for pandoc, without the index; columns of numbers, with or without an interval, to the right.
 
     Feature names and the quantities of Tables 2-4 are typeset, Markdown's own characters are escaped.
 
     Args:
         digits: significant digits of a number that is not an integer.
-        decimals: instead, digits after the point, one entry for each row.
         labels: headers by column, instead of the column's name with spaces for underscores.
     """
     given = labels or {}
-    numeric = [pd.api.types.is_numeric_dtype(kind) and not pd.api.types.is_bool_dtype(kind) for kind in frame.dtypes]
-    places: Sequence[int | None] = decimals if decimals is not None else [None] * len(frame)
-    cells = pd.DataFrame(
-        {
-            column: [_cell(value, digits, after) for value, after in zip(frame[column], places, strict=True)]
-            for column in frame.columns
-        }
-    )
+    cells = pd.DataFrame({column: [_cell(value, digits) for value in frame[column]] for column in frame.columns})
+    numeric = [cells[column].map(lambda cell: NUMBER.fullmatch(cell) is not None).all() for column in cells]
     headers = [_text(given[column]) if column in given else _header(str(column)) for column in frame.columns]
     return cells.to_markdown(
         index=False,
@@ -179,7 +228,7 @@ def _header(name: str) -> str:
     return words[:1].upper() + words[1:]
 
 
-def _cell(value: Any, digits: int, decimals: int | None) -> str:
+def _cell(value: Any, digits: int, decimals: int | None = None) -> str:
     if value is None or value is pd.NA or (isinstance(value, (float, np.floating)) and np.isnan(value)):
         return NOT_KNOWN
     if isinstance(value, (bool, np.bool_)):

@@ -110,10 +110,12 @@ rule claims:
     input:
         sources("08_claims", "experiments"),
         demonstrations=f"{CASE}/demonstrations/record.json",
-        offline=lambda wildcards: f"{CASE}/{'transfer' if wildcards.case == '3' else 'offline'}_improved/record.json",
+        offline=f"{CASE}/offline_improved/record.json",
+        transfer=lambda wildcards: [f"{CASE}/transfer_improved/record.json"] if wildcards.case == "3" else [],
         online=f"{CASE}/online_improved/record.json",
     output:
         f"{CASE}/experiments/record.json",
+        f"{CASE}/online_budget/record.json",
     log:
         f"{LOG}/08_claims.ipynb",
     priority: -1

@@ -103,8 +103,8 @@ def collect(root: Path, params_root: Path, scale: str, cases: tuple[int, ...], n
                 scores = stage.table("scores.csv", ("stage", "metric", "value"))
                 frames.append(scores.assign(case=case, seed=seed, stage=scores["stage"].map(names)).dropna(subset="stage"))
     seeds = pd.concat(frames, ignore_index=True)[["case", "seed", "stage", "metric", "value"]]
-    names = feature_names(next(iter(params.values())).process.controlled)
-    seeds = pd.concat([seeds, scorecard.relative(seeds, published, names)], ignore_index=True)
+    features = feature_names(next(iter(params.values())).process.controlled)
+    seeds = pd.concat([seeds, scorecard.relative(seeds, published, features)], ignore_index=True)
     return Results(
         scale=scale,
         params=params,

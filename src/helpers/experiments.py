@@ -254,6 +254,16 @@ def sharpness(prepared: Prepared) -> Scores:
     return scores
 
 
+def online_budget(prepared: Prepared) -> pd.DataFrame:
+    """The objective that online learning ends with, by the plant's episodes in each epoch; epochs and betas are the case's."""
+    session, params = prepared.session, prepared.params.budget
+    rows = []
+    for number in params.episodes if prepared.planned(params) else ():
+        result = stages.improve(session, copied(session, prepared.imitator), "x", number)
+        rows.append((number, result.records[-1].episodes, stages.judge(session, mode(session, result.policy))["objective"]))
+    return pd.DataFrame(rows, columns=["episodes_per_epoch", "episodes", "objective"])
+
+
 def transfer(prepared: Prepared) -> Scores:
     """Epochs that transfer and learning from scratch need to the least gap that learning from scratch gets to.
 

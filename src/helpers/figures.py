@@ -26,7 +26,7 @@ from helpers.trajectories import Trajectories
 
 WIDTH = 9.0  # inches; at the 100 dpi of a screen the 900 pixels of the report
 DPI_FILE = 150
-STYLE = {
+STYLE: dict[Any, Any] = {
     "figure.dpi": 100,
     "savefig.dpi": DPI_FILE,
     "font.size": 10,

@@ -21,10 +21,11 @@ from helpers.readings import READINGS, Key, Reading, Values, Vector, simulate
 SHARED = ("sampling_time", "input_bound", "input_low", "input_high")  # of all controllers; none can be zero
 LEAST = 0.1  # lower end of the search for what cannot be zero, in the units of the search
 WORST = 1.0e4  # sampling errors; an unstable loop has no finite features
-SPREAD = 0.2  # first standard deviation of CMA-ES, in the units of the search
+SPREAD = 0.3  # first standard deviation of CMA-ES, in the units of the search
 STARTS = (0.15, 0.75)  # where random starts lie, in the units of the search
+POPULATION = 16  # of CMA-ES, twice its default for six settings: a single start misses the valley less often
 DIFFERENCE = 3.0e-3  # relative step of the slopes of the least squares; smaller ones meet the kinks of single trajectories
-FIRST_STEP, GROWTH = 0.01, 1.7  # steps of a profile, in the units of the search
+FIRST_STEP, GROWTH = 0.015, 1.9  # steps of a profile, in the units of the search
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,7 @@ def search(problem: Problem, start: Vector, evaluations: int, n_trajectories: in
     options = {
         "bounds": [problem.lower.tolist(), 1.0],
         "maxfevals": evaluations,
+        "popsize": POPULATION,
         "seed": np.nan,  # numpy's global generator is neither seeded nor used
         "randn": lambda *shape: generator.standard_normal(shape),
         "verbose": -9,
@@ -118,8 +120,8 @@ def polish(problem: Problem, start: Vector, iterations: int, n_trajectories: int
         start,
         bounds=(problem.lower, 1.0),
         diff_step=DIFFERENCE,
-        ftol=1e-6,
-        xtol=1e-5,
+        ftol=1e-5,
+        xtol=1e-4,
         max_nfev=iterations,
         args=(n_trajectories,),
     )
@@ -138,11 +140,11 @@ def fit(problem: Problem, scale: IdentificationScaleParams) -> list[Fit]:
 
 
 def refit(problem: Problem, values: Values, scale: IdentificationScaleParams) -> Fit:
-    """The best fit in reach of given settings: their own valley, or the one that a short search from them finds."""
+    """The fit in reach of given settings: in their own valley, or in a better one that a short search from them finds."""
     begin = problem.position(values)
     found = search(problem, begin, scale.evaluations_reading, scale.draws_search, np.random.default_rng(problem.seed))
-    fits = [polish(problem, start, scale.iterations, scale.draws) for start in (begin, found)]
-    return min(fits, key=lambda fit: fit.loss)
+    start = min((begin, found), key=lambda z: problem.loss(z, scale.draws))
+    return polish(problem, start, scale.iterations, scale.draws)
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,7 @@ def precondition(policy: LSTMPolicy, batch: Trajectories, task: ControlTask, tru
     damping takes (Schulman et al. 2015, Appendix C). There is no line search.
     """
     parameters = list(policy.parameters())
-    gradient = parameters_to_vector([parameter.grad for parameter in parameters])
+    gradient = parameters_to_vector([parameter.grad for parameter in parameters if parameter.grad is not None])
     product = fisher_product(policy, batch.y[:, :EPISODES], batch.u[:, :EPISODES], task)
 
     def damped(vector: np.ndarray) -> np.ndarray:

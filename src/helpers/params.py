@@ -429,6 +429,12 @@ class BetaParams(ExperimentCases):
     betas: Annotated[tuple[Positive, ...], Field(min_length=1), Leaf("-")]
 
 
+class BudgetParams(ExperimentCases):
+    """Online learning with several numbers of plant episodes an epoch."""
+
+    episodes: Annotated[tuple[Annotated[Count, Field(gt=1, le=EPISODES_PER_EPOCH)], ...], Field(min_length=1), Leaf("episodes")]
+
+
 class BaselineParams(ExperimentCases):
     """The spread of the policy gradient with and without the baseline of Algorithm 1."""
 
@@ -482,6 +488,7 @@ class ExperimentParams(Record):
     frozen_weights: FrozenWeightsParams
     undiscounted: ExperimentCases
     beta: BetaParams
+    budget: BudgetParams
     baseline: BaselineParams
     feature_sets: ExperimentCases
     demonstrators: OtherDemonstratorParams

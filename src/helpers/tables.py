@@ -85,6 +85,8 @@ def spread(numbers: Mapping[str, Any] | pd.Series, digits: int = 3, decimals: in
 def results_table(compared: pd.DataFrame, feature_names: Sequence[str]) -> pd.DataFrame:
     """Table 2, 3 or 4 as text: each printed row and, below it, our median, its interval, that of one run, and the verdict.
 
+    Intervals have a row where there are any.
+
     Args:
         compared: the rows of one case in the comparison with the paper.
     """
@@ -99,7 +101,9 @@ def results_table(compared: pd.DataFrame, feature_names: Sequence[str]) -> pd.Da
             "interval of one run": (shown["pred_low"] + " to " + shown["pred_high"]).where(numbers["pred_low"].notna(), NOT_KNOWN),
             "verdict": numbers["verdict"],
         }
-        rows += [{"quantity": QUANTITIES[row], "source": source, **line.to_dict()} for source, line in lines.items()]
+        for source, line in lines.items():
+            if (line != NOT_KNOWN).any():
+                rows.append({"quantity": QUANTITIES[row], "source": source, **line.to_dict()})
     return pd.DataFrame(rows)
 
 

@@ -254,9 +254,9 @@ def test_markdown_text_is_typeset_or_escaped() -> None:
 
 def test_markdown_becomes_a_table_with_maths_in_html() -> None:
     pypandoc = pytest.importorskip("pypandoc")
-    table = tables.results_table(
-        printed(1).assign(reproduced=lambda frame: frame["reproduced"].where(frame["feature"] != "T-I")), FEATURES
-    )
+    rows = printed(1)
+    rows.loc[rows["feature"] == "T-I", "reproduced"] = np.nan
+    table = tables.results_table(rows, FEATURES)
     html = pypandoc.convert_text(tables.to_markdown(table), "html", format="markdown", extra_args=["--mathml"])
     assert html.count("<tr") == 16
     assert html.count("<math") == 6 + 15

@@ -5,6 +5,7 @@ time, and the gradient can start from what the rollout has computed already. Arr
 trajectories last, so that every gate is a contiguous block.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,13 +27,15 @@ class Tape:
     Attributes:
         signals: [x_t, 1, h_{t-1}] for t = 0..T, shape (T + 1, n_in + 1 + n, K); the last x is never set. The row of ones
             carries the bias, so that one product makes all gates.
-        gates: i_t, f_t, g_t and o_t after their activations, shape (T, 4 n, K).
+        gates: i_t, f_t, o_t and g_t after their activations, shape (T, 4 n, K): those with the logistic function first.
         cells: c_{t-1} for t = 0..T, shape (T + 1, n, K).
+        squashed: tanh(c_t), shape (T, n, K).
     """
 
     signals: Tensor
     gates: Tensor
     cells: Tensor
+    squashed: Tensor
 
     @classmethod
     def blank(cls, n_steps: int, weight: Tensor, n_trajectories: int, used: "Tape | None" = None) -> "Tape":
@@ -49,6 +52,7 @@ class Tape:
                 signals=weight.new_ones(n_steps + 1, weight.shape[1], n_trajectories),
                 gates=weight.new_empty(shape),
                 cells=weight.new_empty(n_steps + 1, width, n_trajectories),
+                squashed=weight.new_empty(n_steps, width, n_trajectories),
             )
         tape.signals[0, -width:] = 0
         tape.cells[0] = 0
@@ -56,7 +60,7 @@ class Tape:
 
     def rows(self, rows: slice) -> "Tape":
         """The same for some of the trajectories."""
-        return Tape(*(entry[..., rows].contiguous() for entry in (self.signals, self.gates, self.cells)))
+        return Tape(*(entry[..., rows].contiguous() for entry in (self.signals, self.gates, self.cells, self.squashed)))
 
     @property
     def hidden(self) -> Tensor:
@@ -69,21 +73,28 @@ class Tape:
         (i, f, g, o) = W [x, 1, h], with the logistic function on i, f and o and tanh on g; c' = f c + i g; h' = o tanh(c').
         """
         width = self.cells.shape[1]
-        now, after = t % len(self.signals), (t + 1) % len(self.signals)
+        now, after, row = t % len(self.signals), (t + 1) % len(self.signals), t % len(self.gates)
         self.signals[now, : len(x)] = x
-        gates = torch.mm(weight, self.signals[now], out=self.gates[t % len(self.gates)])
-        entry, forget, candidate, exit_ = gates.split(width)
-        gates[: 2 * width].sigmoid_()
-        candidate.tanh_()
-        exit_.sigmoid_()
+        gates = torch.mm(weight, self.signals[now], out=self.gates[row])
+        gates[: 3 * width].sigmoid_()
+        gates[3 * width :].tanh_()
+        entry, forget, exit_, candidate = gates.split(width)
         cell = torch.mul(forget, self.cells[now], out=self.cells[after]).addcmul_(entry, candidate)
-        return torch.mul(exit_, cell.tanh(), out=self.signals[after, -width:])
+        squashed = torch.tanh(cell, out=self.squashed[row])
+        return torch.mul(exit_, squashed, out=self.signals[after, -width:])
 
 
 def stacked(layer: nn.LSTM) -> Tensor:
-    """The layer's parameters as one matrix on [x, 1, h], shape (4 n, n_in + 1 + n)."""
-    from_below, from_before, bias_below, bias_before = layer.all_weights[0]
-    return torch.cat([from_below, (bias_below + bias_before)[:, None], from_before], dim=1)
+    """The layer's parameters as one matrix on [x, 1, h], shape (4 n, n_in + 1 + n); torch's gates i, f, g, o as i, f, o, g."""
+    return stack(layer.all_weights[0])
+
+
+def stack(parameters: Sequence[Tensor]) -> Tensor:
+    """`stacked` for the four parameters of a layer in torch's order, or for changes of them."""
+    from_below, from_before, bias_below, bias_before = parameters
+    matrix = torch.cat([from_below, (bias_below + bias_before)[:, None], from_before], dim=1)
+    entry, forget, candidate, exit_ = matrix.chunk(4)
+    return torch.cat([entry, forget, exit_, candidate])
 
 
 class Unroll(torch.autograd.Function):
@@ -113,25 +124,27 @@ class Unroll(torch.autograd.Function):
         """
         (d_hidden,) = gradients
         (weight,) = ctx.saved_tensors
-        signals, gates, cells = ctx.tape.signals, ctx.tape.gates, ctx.tape.cells
+        signals, gates, cells, squashed = ctx.tape.signals, ctx.tape.gates, ctx.tape.cells, ctx.tape.squashed
         width = cells.shape[1]
         recurrent = weight[:, -width:].T.contiguous()
         d_later = torch.zeros_like(cells[0])  # the part of d_h that comes from step t + 1
         d_cell = torch.zeros_like(cells[0])
         d_weight = torch.zeros_like(weight)
+        d_gates = torch.empty_like(gates[0])  # in the gates after their activation
+        d_entry, d_forget, d_exit, d_candidate = d_gates.split(width)
+        logistic, hyperbolic = gates.split([3 * width, width], dim=1)
         for t in reversed(range(len(gates))):
-            entry, forget, candidate, exit_ = gates[t].split(width)
-            squashed = cells[t + 1].tanh()
-            d_h = d_hidden[t] + d_later
-            d_cell += tanh_backward(d_h * exit_, squashed)
-            d_before = d_cell * forget
-            d_candidate = d_cell * entry
-            sigmoid_backward(d_h.mul_(squashed), exit_, grad_input=exit_)
-            sigmoid_backward(d_cell * candidate, entry, grad_input=entry)
-            sigmoid_backward(d_cell.mul_(cells[t]), forget, grad_input=forget)
-            tanh_backward_into(d_candidate, candidate, grad_input=candidate)
-            d_cell = d_before
-            d_later = recurrent @ gates[t]
+            entry, forget, exit_, candidate = gates[t].split(width)
+            d_h = d_later.add_(d_hidden[t])
+            d_cell += tanh_backward(d_h * exit_, squashed[t])
+            torch.mul(d_cell, candidate, out=d_entry)
+            torch.mul(d_cell, cells[t], out=d_forget)
+            torch.mul(d_h, squashed[t], out=d_exit)
+            torch.mul(d_cell, entry, out=d_candidate)
+            d_cell *= forget
+            sigmoid_backward(d_gates[: 3 * width], logistic[t], grad_input=logistic[t])
+            tanh_backward_into(d_candidate, candidate, grad_input=hyperbolic[t])
+            torch.mm(recurrent, gates[t], out=d_later)
             d_weight.addmm_(gates[t], signals[t].T)
         d_inputs = weight[:, : ctx.n_inputs].T @ gates if ctx.needs_input_grad[0] else None
         return d_inputs, d_weight, None

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 from torch.nn.utils import parameters_to_vector
 
-from helpers.lstm import Tape, stacked
+from helpers.lstm import Tape, stack, stacked
 from helpers.policy import RELU6_TOP, LSTMPolicy
 from helpers.task import ControlTask
 from helpers.trajectories import Trajectories
@@ -31,11 +31,11 @@ class Layer:
         gates = self.tape.gates
         slope = gates * (1 - gates)
         width = len(weight) // 4
-        slope[:, 2 * width : 3 * width] = 1 - gates[:, 2 * width : 3 * width] ** 2
-        squashed = self.tape.cells[1:].tanh()
-        entry, forget, candidate, exit_ = gates.split(width, dim=1)
-        # d z_t -> what it adds to d c_t, and with the last block to d h_t: each gate's partner times its slope.
-        self.into = torch.stack([candidate, self.tape.cells[:-1], entry, squashed], dim=1) * slope.unflatten(1, (4, width))
+        slope[:, 3 * width :] = 1 - gates[:, 3 * width :] ** 2
+        squashed = self.tape.squashed
+        entry, forget, exit_, candidate = gates.split(width, dim=1)
+        # d z_t -> what it adds to d c_t, and with the third block to d h_t: each gate's partner times its slope.
+        self.into = torch.stack([candidate, self.tape.cells[:-1], squashed, entry], dim=1) * slope.unflatten(1, (4, width))
         self.forget, self.onward = forget, exit_ * (1 - squashed**2)
 
     def tangent(self, d_inputs: Tensor, d_weight: Tensor) -> Tensor:
@@ -47,8 +47,8 @@ class Layer:
         d_h = d_cell = torch.zeros_like(self.forget[0])
         for t, d_z in enumerate(d_gates):
             moved = torch.addmm(d_z, recurrent, d_h).view_as(self.into[t]) * self.into[t]
-            d_cell = torch.addcmul(moved[:3].sum(0), self.forget[t], d_cell)
-            d_h = torch.addcmul(moved[3], self.onward[t], d_cell, out=d_hidden[t])
+            d_cell = torch.addcmul(moved[0] + moved[1] + moved[3], self.forget[t], d_cell)
+            d_h = torch.addcmul(moved[2], self.onward[t], d_cell, out=d_hidden[t])
         return d_hidden
 
 
@@ -74,9 +74,7 @@ def jacobian_product(
     def product(pieces: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         moved, each = first, iter(pieces)
         for layer, kink in zip(layers, kinks, strict=True):
-            from_below, from_before, bias_below, bias_before = (next(each) for _ in range(4))
-            d_weight = torch.cat([from_below, (bias_below + bias_before)[:, None], from_before], dim=1)
-            moved = layer.tangent(moved, d_weight) * kink
+            moved = layer.tangent(moved, stack([next(each) for _ in range(4)])) * kink
         d_output = (next(each) @ signal + top @ moved + next(each)[:, None]) * inside
         mean, std = d_output.mT.chunk(2, dim=-1)
         return mean, std

@@ -203,12 +203,14 @@ def test_claims_are_put_together_over_cases_and_quantities():
         ("d", 1, "holds"),
         ("d", 1, "cannot tell"),
         ("e", 1, "not comparable"),
+        ("f", 2, "does not hold"),
+        ("f", 2, "holds"),
     ]
     claims = pd.DataFrame(rows, columns=["id", "case", "verdict"]).assign(section="5.1")
     claims["statement"] = "the claim " + claims["id"]
     assert scorecard.verdicts_of_claims(claims) == {
         "holds": ["The claim a (5.1)"],
-        "holds in part": ["The claim b (5.1): not in Case Study II"],
+        "holds in part": ["The claim b (5.1): not in Case Study II", "The claim f (5.1): not throughout"],
         "does not hold": ["The claim c (5.1)"],
         "cannot tell": ["The claim d (5.1)"],
         "not comparable": ["The claim e (5.1)"],

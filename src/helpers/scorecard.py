@@ -197,7 +197,9 @@ def verdicts_of_claims(claims: pd.DataFrame) -> dict[str, list[str]]:
             found[verdicts.pop()].append(text)
         elif {"holds", "does not hold"} <= verdicts:
             failing = rows.loc[rows["verdict"] == "does not hold", "case"].unique()
-            found["holds in part"].append(f"{text}: not in Case Study {', '.join(ROMAN[case - 1] for case in failing)}")
+            one_case = len(set(rows["case"])) == 1
+            where = "throughout" if one_case else f"in Case Study {', '.join(ROMAN[case - 1] for case in failing)}"
+            found["holds in part"].append(f"{text}: not {where}")
         else:
             found["does not hold" if "does not hold" in verdicts else "cannot tell"].append(text)
     return found

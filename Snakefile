@@ -106,6 +106,17 @@ rule transfer:
         f"{RUN} 04_knowledge_transfer {{log:q}} -p case 3 -p seed {{wildcards.seed}} -p variant {{wildcards.variant}} {ROOTS}"
 
 
+rule inferred_settings:
+    input:
+        sources("00_inferred_settings", "identification", "published", *(f"case_{case}" for case in CASES)),
+    output:
+        f"{RESULTS}/{SCALE}/seed_0/inferred_settings/record.json",
+    log:
+        f"{RESULTS}/{SCALE}/seed_0/notebooks/00_inferred_settings.ipynb",
+    shell:
+        f"{RUN} 00_inferred_settings {{log:q}} -p seed 0 {ROOTS}"
+
+
 rule claims:
     input:
         sources("08_claims", "experiments"),
@@ -126,7 +137,8 @@ rule claims:
 def evidence():
     """The runs beyond the paper's own."""
     folder = f"{RESULTS}/{SCALE}"
-    stages = [f"{folder}/seed_{seed}/case_{case}/experiments/record.json" for seed in SEEDS for case in CASES]
+    stages = [f"{folder}/seed_0/inferred_settings/record.json"]
+    stages += [f"{folder}/seed_{seed}/case_{case}/experiments/record.json" for seed in SEEDS for case in CASES]
     for seed in TRIAL_SEEDS:
         for trial in TRIALS:
             stages += [f"{folder}/seed_{seed}/case_{case}/offline_{trial}/record.json" for case in (1, 2)]

@@ -48,12 +48,12 @@ def test_a_trial_is_its_base_but_for_the_leaves_that_the_file_names(root):
 
 
 def test_trials_leave_the_variants_the_leaves_and_their_hash_alone(folder, root):  # noqa: F811
-    edit(folder / TRIALS, {"small_weight_step.weights.step.value": 0.2})
+    edit(folder / TRIALS, {"undamped_weights.weights.decay.value": 0.2})
     before, after = load(root, 1), load(folder, 1)
     assert after.leaves == before.leaves
     assert not [row for row in after.leaves if row["file"] == TRIALS]
     assert parameters_hash(after) == parameters_hash(before)
-    assert after.learning.variants["small_weight_step"].weights.step == 0.2
+    assert after.learning.variants["undamped_weights"].weights.decay == 0.2
     (folder / TRIALS).write_text("{}\n")
     assert load(folder, 1).learning.variants == {name: before.learning.variants[name] for name in ("improved", "printed")}
 
@@ -67,7 +67,7 @@ def test_the_variants_of_the_paper_use_none_of_the_optional_settings(root):
 
 REFUSED = [
     ({"constant_step.base": "best"}, "constant_step.base", "improved, printed"),
-    ({"constant_step.base": "small_step"}, "constant_step.base", "improved, printed"),
+    ({"constant_step.base": "last_weights"}, "constant_step.base", "improved, printed"),
     ({"constant_step.base": DELETE}, "constant_step.base", "missing"),
     ({"constant_step.title": ""}, "constant_step.title", "1 character"),
     ({"constant_step.family": "luck"}, "constant_step.family", "step size"),

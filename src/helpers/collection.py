@@ -15,6 +15,7 @@ from helpers.session import parameters_hash
 
 DEMONSTRATIONS, ONLINE, BUDGET, EXPERIMENTS = "demonstrations", "online_improved", "online_budget", "experiments"
 OFFLINE = {"offline": "improved", "offline_printed": "printed"}  # stage in seeds.csv and the variant behind it
+INFERRED = "inferred_settings"  # which has no case, and stands with the first seed
 SCRATCH = "offline_improved"  # of a case that starts from another: the same learning without the transfer
 MADE_BY = {"demonstrations": "01", "offline": "02", "online": "03 (04 for the transfer case)", "transfer": "04"}
 
@@ -30,7 +31,7 @@ class Results:
             the headline variant (offline of a transfer case is after the transfer); offline_printed; offline_scratch (the
             transfer case learned from nothing). The ratios of `scorecard.relative` are among the rows.
         claims: columns `claims.COLUMNS`; budget: seed, case, episodes_per_epoch, objective; trials: trial, family,
-            description, case, seed, gap. Each is empty where it was not run.
+            description, case, seed, gap. Each is empty where it was not run. inferred: what notebook 00 wrote, if it was run.
     """
 
     scale: str
@@ -41,6 +42,7 @@ class Results:
     claims: pd.DataFrame
     budget: pd.DataFrame
     trials: pd.DataFrame
+    inferred: Stage | None = None
 
     @cached_property
     def feature_names(self) -> list[str]:
@@ -104,6 +106,7 @@ def collect(root: Path, params_root: Path, scale: str, cases: tuple[int, ...], n
                 frames.append(scores.assign(case=case, seed=seed, stage=scores["stage"].map(names)).dropna(subset="stage"))
     seeds = pd.concat(frames, ignore_index=True)[["case", "seed", "stage", "metric", "value"]]
     features = feature_names(next(iter(params.values())).process.controlled)
+    inferred = root / scale / "seed_0" / INFERRED
     seeds = pd.concat([seeds, scorecard.relative(seeds, published, features)], ignore_index=True)
     return Results(
         scale=scale,
@@ -114,6 +117,7 @@ def collect(root: Path, params_root: Path, scale: str, cases: tuple[int, ...], n
         claims=_claims(root, params_root, scale, cases, n_seeds),
         budget=_budget(root / scale, cases, n_seeds),
         trials=_trials(root / scale, params, seeds, n_seeds),
+        inferred=load_stage(inferred, "notebook 00") if (inferred / RECORD).is_file() else None,
     )
 
 

@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 
 from helpers.params import IdentificationScaleParams, Params
 from helpers.randomness import stream
-from helpers.readings import READINGS, Key, Reading, Values, Vector, simulate
+from helpers.readings import MAIN, Key, Reading, Values, Vector, simulate
 
 SHARED = ("sampling_time", "input_bound", "input_low", "input_high")  # of all controllers; none can be zero
 LEAST = 0.1  # lower end of the search for what cannot be zero, in the units of the search
@@ -56,7 +56,7 @@ class Problem:
     free: Values
     seed: int
     fixed: Values = field(default_factory=dict)
-    reading: Reading = READINGS[0]
+    reading: Reading = MAIN
     overshoot_unit: float | None = None
 
     @property
@@ -151,8 +151,6 @@ def refit(problem: Problem, values: Values, scale: IdentificationScaleParams) ->
 class Profile:
     """Least loss over all other settings as a function of one, its points in ascending order."""
 
-    key: Key
-    best: float
     grid: Vector
     losses: Vector
 
@@ -185,30 +183,22 @@ def steps(begin: float, lower: float, n_steps: int, sign: int) -> Iterator[float
             return
 
 
-def profile(
-    problems: Sequence[Problem], found: Sequence[Fit], key: Key, end: float, rise: float, scale: IdentificationScaleParams
-) -> Profile:
-    """The profile of one setting, which all problems share; each re-optimises its own others from the last point's.
+def profile(problem: Problem, best: Fit, key: Key, rise: float, scale: IdentificationScaleParams) -> Profile:
+    """The profile of one setting: the others are fitted again at each of its values, from where they were at the last one.
 
     Args:
-        found: the best fit of each problem, on `scale.draws` trajectories; `end`: of the search.
+        best: the fit of the problem on `scale.draws` trajectories.
         rise: the walk to a side ends where the loss has risen by more.
     """
-    best = found[0].settings[key]
-    lower = LEAST if key[0] in SHARED else 0.0
-    centre = float(np.clip(np.sqrt(best / end), lower, 1.0))
-    points = {best: sum(fit.loss for fit in found)}
+    index, end = list(problem.free).index(key), problem.free[key]
+    points = {best.settings[key]: best.loss}
     for sign in (-1, 1):
-        values: list[Values] = [fit.settings for fit in found]
-        for z in steps(centre, lower, scale.profile_steps, sign):
-            held = [problem.holding({key: end * z**2}) for problem in problems]
-            fits = [
-                polish(problem, problem.position(last), scale.iterations, scale.draws)
-                for problem, last in zip(held, values, strict=True)
-            ]
-            values = [fit.settings for fit in fits]
-            points[end * z**2] = sum(fit.loss for fit in fits)
-            if points[end * z**2] > points[best] + rise:
+        last = best
+        for z in steps(float(best.z[index]), float(problem.lower[index]), scale.profile_steps, sign):
+            held = problem.holding({key: end * z**2})
+            last = polish(held, held.position(last.settings), scale.iterations, scale.draws)
+            points[end * z**2] = last.loss
+            if last.loss > best.loss + rise:
                 break
     ordered = sorted(points)
-    return Profile(key, best, np.array(ordered), np.array([points[value] for value in ordered]))
+    return Profile(np.array(ordered), np.array([points[value] for value in ordered]))

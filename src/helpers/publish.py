@@ -117,8 +117,13 @@ def main() -> int:
         case = path.parents[1].name
         shutil.copy2(path, partial / "notebooks" / f"{path.stem.removesuffix('_improved')}_{case}.ipynb")
     shutil.copy2(LATEST / "notebooks/05_report.ipynb", partial / "notebooks")
-    if (REFERENCE / "benchmarks").is_dir():  # a run of its own, which stays
-        shutil.copytree(REFERENCE / "benchmarks", partial / "benchmarks")
+    inferred = first / "inferred_settings"
+    if inferred.is_dir():
+        shutil.copytree(inferred, partial / "inferred_settings")
+        shutil.copy2(first / "notebooks/00_inferred_settings.ipynb", partial / "notebooks")
+    for part in ("benchmarks", "inferred_settings"):  # runs of their own, which stay
+        if (REFERENCE / part).is_dir() and not (partial / part).is_dir():
+            shutil.copytree(REFERENCE / part, partial / part)
     shutil.rmtree(REFERENCE, ignore_errors=True)
     partial.rename(REFERENCE)
     readme.write_text(text, encoding="utf-8")

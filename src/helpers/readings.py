@@ -30,34 +30,39 @@ class Reading:
     """One way to read what the paper leaves open; what is not named here is as in the parameter files.
 
     Attributes:
+        first_error: |e| before the first step: a number, or "own" for the error of each initial state. Its mean is one, so that
+            the number one, which the files hold, gives the same features, but with a smaller spread of Type III.
         conditional_integration: the integral stands still while the command lies outside the bounds and would move further out.
         derivative_from_zero: the first sample has a derivative, of an error that was zero before.
-        exact_drift: the drift is integrated exactly between two samples, not by one Euler step.
-        first_error: |e| before the first step: a number, or "own" for the error of the initial state.
+        exact_drift: the drift is integrated exactly between two samples, not by one Euler step; the disturbance is not.
+        substeps: Euler-Maruyama steps between two samples.
     """
 
     name: str = "as in the parameter files"
+    first_error: float | str | None = "own"
     conditional_integration: bool = False
     derivative_from_zero: bool = False
     noise_as_variance: bool = False
     start_as_variance: bool = False
+    symmetric_bounds: bool = False
     exact_drift: bool = False
-    symmetric_bounds: bool = True
+    substeps: int = 1
     features_on: str | None = None
-    first_error: float | str | None = None
 
 
+MAIN = Reading()
 READINGS = (
-    Reading(),
-    Reading("conditional integration", conditional_integration=True),
-    Reading("observation noise is a variance", noise_as_variance=True),
-    Reading("features on y", features_on="y"),
+    MAIN,
+    Reading("|e| before the first step is 1", first_error=1.0),
     Reading("|e| before the first step is 0", first_error=0.0),
-    Reading("|e| before the first step is that of the initial state", first_error="own"),
-    Reading("spread of the initial state is a variance", start_as_variance=True),
+    Reading("conditional integration", conditional_integration=True),
     Reading("derivative at the first sample", derivative_from_zero=True),
+    Reading("observation noise is a variance", noise_as_variance=True),
+    Reading("spread of the initial state is a variance", start_as_variance=True),
+    Reading("features on y", features_on="y"),
+    Reading("bounds as wide downwards as upwards", symmetric_bounds=True),
     Reading("drift integrated exactly", exact_drift=True),
-    Reading("bounds not symmetric", symmetric_bounds=False),
+    Reading("four Euler-Maruyama steps a sample", substeps=4),
 )
 
 
@@ -82,6 +87,25 @@ class ReadPID(PID):
             outward = ((command > self.task.input_high) & (error > 0)) | ((command < self.task.input_low) & (error < 0))
             after = replace(after, integral=torch.where(outward, memory.integral, after.integral))
         return command, after
+
+
+class FinerProcess(LinearProcess):
+    """The process of Eq. 4.1.3 integrated in several Euler-Maruyama steps between two samples.
+
+    The noise handed in is that of the first of them; the others' comes from a generator of its own.
+    """
+
+    def __init__(self, params: ProcessParams, substeps: int, generator: torch.Generator) -> None:
+        super().__init__(params.model_copy(update={"sampling_time": params.sampling_time / substeps}), DTYPE)
+        self.substeps = substeps
+        self.generator = generator
+
+    def step(self, x: Tensor, u: Tensor, noise: Tensor) -> Tensor:
+        """The state at the next sample."""
+        x = super().step(x, u, noise)
+        for _ in range(self.substeps - 1):
+            x = super().step(x, u, torch.randn(x.shape, generator=self.generator, dtype=DTYPE))
+        return x
 
 
 def exact_drift(process: ProcessParams) -> ProcessParams:
@@ -147,7 +171,10 @@ def simulate(params: Params, values: Values, reading: Reading, n_trajectories: i
     time = params.process.sampling_time
     features = FeatureMap(params.features, task, time)
     controller = ReadPID(params.demonstrator, task, time, reading)
-    trajectories = rollout(LinearProcess(params.process, DTYPE), controller, task, n_trajectories, generator)
+    process = LinearProcess(params.process, DTYPE)
+    if reading.substeps > 1:
+        process = FinerProcess(params.process, reading.substeps, torch.Generator().manual_seed(generator.initial_seed() + 1))
+    trajectories = rollout(process, controller, task, n_trajectories, generator)
     v = features.trajectory(trajectories)
     if reading.first_error == "own":
         signal = trajectories.x if params.features.features_on == "x" else trajectories.y

@@ -106,6 +106,9 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
         tabulated["claims"] = results.claims
     if len(results.trials):
         tabulated["trials"] = tables.trials_table(results.trials)
+    if results.inferred is not None:
+        for name in ("settings", "hypotheses", "prediction"):
+            tabulated[f"inferred_{name}"] = results.inferred.table(f"{name}.csv")
     return tabulated
 
 
@@ -151,6 +154,9 @@ def write(folder: Path, results: Results) -> Path:
         tabulated["comparison"].to_csv(partial / "comparison.csv", index=False, float_format="%.10g")
         results.seeds.to_csv(partial / "seeds.csv", index=False, float_format="%.10g")
         (partial / "provenance.json").write_text(json.dumps(origin, indent=1) + "\n", encoding="utf-8")
+        if results.inferred is not None:
+            for ending in ("svg", "png"):
+                shutil.copy2(results.inferred.path(f"profiles.{ending}"), partial / f"figures/inferred_profiles.{ending}")
         if (BENCHMARKS / "scaling.svg").is_file():
             shutil.copy2(BENCHMARKS / "scaling.svg", partial / "figures/benchmarks.svg")
         text = render(results, tabulated, origin)

@@ -14,6 +14,7 @@ from helpers.sources import PROJECT
 
 NOTEBOOKS = sorted(path.stem for path in (PROJECT / "notebooks").glob("[0-9]*.ipynb"))
 OFFLINE, REPORT = "02_offline_irl", "05_report"
+OF_ALL_CASES = {REPORT: ("seeds",), "00_inferred_settings": ("seed",)}
 
 
 def defaults(notebook):
@@ -44,7 +45,7 @@ def test_the_parameters_cell_names_known_parameters_of_the_right_type(notebook):
     found = defaults(notebook)
     assert set(found) <= set(NOTEBOOK_PARAMETERS)
     assert {"scale", "input_root", "output_root", "params_root"} <= set(found)
-    assert {"seeds"} <= set(found) if notebook == REPORT else {"case", "seed"} <= set(found)
+    assert set(OF_ALL_CASES.get(notebook, ("case", "seed"))) == {"case", "seed", "seeds"} & set(found)
     assert found["scale"] == "smoke"
     check_parameters(notebook, found)
 

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from helpers.params import load_trials
-from helpers.sources import modules_behind, notebook_path
+from helpers.sources import PROJECT, modules_behind, notebook_path
 
 ROOT = Path(workflow.basedir)
 SCALE = config.get("scale", "paper")
@@ -29,7 +29,7 @@ PARAMS = [str(ROOT / "params" / f"{name}.yaml") for name in ("process", "demonst
 
 def sources(notebook, *params):
     """What a result depends on beside earlier stages: its notebook, its parameter files and the modules behind it."""
-    code = [str(path) for path in (notebook_path(notebook), *modules_behind(notebook))]
+    code = [str(ROOT / path.relative_to(PROJECT)) for path in (notebook_path(notebook), *modules_behind(notebook))]
 
     def inputs(wildcards):
         case, variant = getattr(wildcards, "case", 3), getattr(wildcards, "variant", "")

@@ -21,7 +21,7 @@ from traitlets.config import Config
 
 from helpers.params import ParameterError
 from helpers.request import SessionError, check_parameters
-from helpers.sources import PROJECT, notebook_path
+from helpers.sources import PROJECT
 
 NOTEBOOKS = PROJECT / "notebooks"
 
@@ -33,7 +33,7 @@ def execute(notebook: str, output: Path, parameters: dict[str, Any]) -> None:
         ParameterError, SessionError: if the parameters cannot be used; nothing was run then.
         PapermillExecutionError: if a cell failed; its traceback stands in the executed copy.
     """
-    source = notebook_path(notebook)
+    source = NOTEBOOKS / f"{notebook}.ipynb"
     if not source.is_file():
         known = ", ".join(sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb")))
         raise SessionError(f"{source}: there is no such notebook; the notebooks are {known}")

@@ -15,7 +15,7 @@ from helpers.identification import Fit, Problem, Profile, polish, profile, refit
 from helpers.params import ParameterError, load, load_identification
 from helpers.process import LinearProcess
 from helpers.randomness import stream
-from helpers.readings import GAINS, READINGS, TIME, Reading, exact_drift, simulate, with_settings
+from helpers.readings import GAINS, MAIN, TIME, FinerProcess, Reading, exact_drift, simulate, with_settings
 from helpers.request import PROJECT
 from helpers.rollout import rollout
 from helpers.task import ControlTask
@@ -25,7 +25,7 @@ CASES = {case: load(ROOT, case) for case in (1, 2, 3)}
 FIRST = CASES[1]
 BOUND_T, BOUND_C = ("input_bound", "T_E"), ("input_bound", "C_A0")
 TRUTH = {TIME: 0.05, BOUND_T: 45.0}
-AS_FILED = READINGS[0]
+AS_FILED = Reading(first_error=None)
 REFERENCE = PROJECT / "reports/reference/inferred_settings"
 
 
@@ -83,13 +83,29 @@ def test_the_exact_drift_is_the_solution_of_the_undisturbed_equation():
     assert np.abs(euler - solved).max() > 1e-3
 
 
+def test_finer_steps_keep_the_mean_of_the_exact_drift_and_spread_as_an_integral():
+    """One loop without coupling at rest: x' = a x + b u + d x w has a mean and a second moment in closed form over a sample."""
+    a, b, d, dt, x0, u0 = -4.0, 0.5, 0.5, 0.04, 1.0, 20.0
+    update = {"drift_state": ((a, 0.0), (0.0, a)), "drift_input": ((b, 0.0), (0.0, b)), "disturbance": (d, d), "sampling_time": dt}
+    generator = torch.Generator().manual_seed(0)
+    finer = FinerProcess(FIRST.process.model_copy(update=update), 16, generator)
+    ones = torch.ones(200_000, 2, dtype=torch.float64)
+    x = finer.step(x0 * ones, u0 * ones, torch.randn(ones.shape, generator=generator, dtype=torch.float64))
+    moments = solve_ivp(
+        lambda _, m: [a * m[0] + b * u0, (2 * a + d**2) * m[1] + 2 * b * u0 * m[0]], (0, dt), [x0, x0**2], rtol=1e-10, atol=1e-12
+    ).y[:, -1]
+    assert x.mean().item() == pytest.approx(moments[0], rel=2e-3)
+    assert x.var().item() == pytest.approx(moments[1] - moments[0] ** 2, rel=2e-2)
+    assert simulate(FIRST, {}, Reading(substeps=3), 20, draws()).v.equal(simulate(FIRST, {}, Reading(substeps=3), 20, draws()).v)
+
+
 def test_the_error_of_the_initial_state_takes_the_place_of_the_number():
     """Type III at t = 1 by hand from the true states; all later ones stay."""
     trajectories, _ = recorded(FIRST)
     target = torch.tensor(FIRST.case.set_point, dtype=torch.float64)
     first = ((target - trajectories.x[0]) / target).abs()
     given = simulate(FIRST, {}, AS_FILED, 40, draws()).v
-    own = simulate(FIRST, {}, Reading(first_error="own"), 40, draws()).v
+    own = simulate(FIRST, {}, MAIN, 40, draws()).v
     torch.testing.assert_close(own[:, :4], given[:, :4])
     torch.testing.assert_close(own[:, 4:] - given[:, 4:], (FIRST.features.initial_error - first) / FIRST.process.sampling_time)
 
@@ -124,7 +140,7 @@ def test_the_pid_of_a_reading_without_noise(conditional, from_zero, monkeypatch)
         return seen[-1]
 
     monkeypatch.setattr("helpers.readings.rollout", watched)
-    simulate(calm, {}, Reading(conditional_integration=conditional, derivative_from_zero=from_zero), 2, draws())
+    simulate(calm, {}, Reading(first_error=None, conditional_integration=conditional, derivative_from_zero=from_zero), 2, draws())
     expected = one_loop_by_hand(seen[0].n_steps, conditional, from_zero)
     np.testing.assert_allclose(seen[0].command[:, 0].numpy(), expected, rtol=1e-9, atol=1e-9)
 
@@ -147,6 +163,7 @@ def known(**changes):
         sampling_error={case: row.sampling_error(500) for case, row in rows.items()},
         free={TIME: 0.1, BOUND_T: 200.0},
         seed=0,
+        reading=AS_FILED,
     )
     return replace(problem, **changes)
 
@@ -208,7 +225,7 @@ def test_what_is_held_is_neither_searched_nor_lost():
 
 def test_the_interval_of_a_parabola_is_exact():
     grid = np.array([1.0, 2.0, 3.5, 5.0, 9.0])
-    parabola = Profile(BOUND_T, 3.5, grid, 7 + 4 * (grid - 3.5) ** 2)
+    parabola = Profile(grid, 7 + 4 * (grid - 3.5) ** 2)
     assert parabola.interval(4.0) == pytest.approx((2.5, 4.5))
     assert parabola.interval(16.0) == pytest.approx((1.5, 5.5))
     assert parabola.interval(1000.0) == (1.0, 9.0)
@@ -217,17 +234,19 @@ def test_the_interval_of_a_parabola_is_exact():
 def test_a_profile_fits_the_other_settings_again():
     """Its points lie below those of a cut through the loss, and its floor is where the settings are."""
     problem = known()
-    scale = load_identification(ROOT, FIRST).scales["smoke"].model_copy(update={"draws": 60, "iterations": 20, "profile_steps": 2})
+    scale = load_identification(ROOT, FIRST).scales["smoke"].model_copy(update={"draws": 60, "iterations": 20})
     truth = Fit(TRUTH, problem.position(TRUTH), 0.0)
-    found = profile([problem], [truth], TIME, 0.1, 1e9, scale)
+    found = profile(problem, truth, TIME, 1e9, scale)
     cut = [problem.holding({TIME: time, BOUND_T: 45.0}).loss(np.array([]), 60) for time in found.grid]
-    assert found.grid[2] == pytest.approx(0.05)
+    assert found.grid[1] == pytest.approx(0.05)
     assert (np.diff(found.grid) > 0).all()
     assert (found.losses <= np.array(cut) + 1e-9).all()
-    assert (found.losses[[0, 1, 3, 4]] > 1).all()
+    assert (found.losses[[0, 2]] > 1).all()
     assert found.losses[0] < cut[0] - 1
-    both = profile([problem, problem], [truth, truth], TIME, 0.1, 1e9, scale)
-    np.testing.assert_allclose(both.losses, 2 * found.losses)
+    below = problem.holding({("input_low", "T_E"): -30.0})
+    assert below.settings(below.position(TRUTH))[("input_low", "T_E")] == -30.0
+    side = replace(problem, free={("input_low", "T_E"): -200.0})
+    assert side.settings(side.position({("input_low", "T_E"): -30.0}))[("input_low", "T_E")] == pytest.approx(-30.0)
 
 
 def test_the_steps_of_a_profile_grow_and_end_at_the_ends_of_the_search():
@@ -244,7 +263,7 @@ def test_the_steps_of_a_profile_grow_and_end_at_the_ends_of_the_search():
 def test_a_wrong_file_is_one_sentence(tmp_path):
     text = (ROOT / "identification.yaml").read_text(encoding="utf-8")
     for old, new, words in (
-        ("[60.0, 200.0]", "[60.0]", ["search.input_bound", "2 entries"]),
+        ("[40.0, 120.0]", "[40.0]", ["search.input_bound", "2 entries"]),
         ("  paper:", "  large:", ["scales.paper", "missing"]),
         ("settled_by:", "settled:", ["settled"]),
     ):
@@ -268,10 +287,12 @@ def test_the_parameter_files_hold_what_the_reference_run_inferred():
     found = pd.read_csv(REFERENCE / "settings.csv").set_index(["setting", "component"])
     process = FIRST.process
     filed = {TIME: process.sampling_time}
-    for index, name in enumerate(process.manipulated):
-        assert process.input_low[index] == -process.input_high[index]
-        filed |= {(side, name): getattr(process, side)[index] for side in ("input_low", "input_high")}
-        filed[("input_bound", name)] = process.input_high[index]
+    for name, low, high in zip(process.manipulated, process.input_low, process.input_high, strict=True):
+        if ("input_bound", name) in found.index:
+            assert low == -high
+            filed[("input_bound", name)] = high
+        else:
+            filed |= {("input_low", name): low, ("input_high", name): high}
     for name, case in (("PID1", 1), ("PID2", 2)):
         gains = CASES[case].demonstrator.model_dump()
         filed |= {(f"{name}.{kind}", loop): gains[kind][i] for kind in GAINS for i, loop in enumerate(process.controlled)}

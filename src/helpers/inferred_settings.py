@@ -14,8 +14,11 @@ from helpers.features import feature_names
 from helpers.identification import Fit, Problem, Profile, polish, profile, refit
 from helpers.params import Params
 from helpers.randomness import stream
-from helpers.readings import GAINS, READINGS, TIME, Key, Reading, Values, Vector, simulate
+from helpers.readings import GAINS, MAIN, READINGS, TIME, Key, Reading, Values, Vector, simulate
 from helpers.session import IdentificationSession
+
+FINAL_TOLERANCE = 1.0e-7
+TWO_SIDED = ("T_E",)  # inputs whose bounds are fitted side by side; PID1 never meets the upper bound of the other
 
 
 @dataclass(frozen=True)
@@ -49,38 +52,39 @@ class Study:
         """The cases of a demonstrator."""
         return {case: params for case, params in self.session.params.items() if params.case.demonstrator == demonstrator}
 
-    def ends(self, *settings: str) -> dict[Key, float]:
-        """The end of the search of each of these settings; that of a lower bound is negative."""
-        process, search = self.any_params.process, self.session.identification.search
-        ends: dict[Key, float] = {}
-        for setting in settings:
-            if setting == TIME[0]:
-                ends[TIME] = search.sampling_time
-            elif setting in GAINS:
-                ends |= {(setting, loop): end for loop, end in zip(process.controlled, getattr(search, setting), strict=True)}
+    def gain_ends(self) -> dict[Key, float]:
+        """The end of the search of each gain."""
+        loops, search = self.any_params.process.controlled, self.session.identification.search
+        return {(kind, loop): end for kind in GAINS for loop, end in zip(loops, getattr(search, kind), strict=True)}
+
+    def shared_ends(self, reading: Reading = MAIN) -> dict[Key, float]:
+        """The end of the search of what all demonstrators share: sampling time and bounds; that of a lower bound is negative."""
+        options = self.session.identification
+        ends: dict[Key, float] = {TIME: options.search.sampling_time}
+        for name, end in zip(self.any_params.process.manipulated, options.search.input_bound, strict=True):
+            if name in TWO_SIDED and not reading.symmetric_bounds:
+                ends |= {("input_low", name): -end, ("input_high", name): end}
             else:
-                sign = -1 if setting == "input_low" else 1
-                ends |= {(setting, name): sign * end for name, end in zip(process.manipulated, search.input_bound, strict=True)}
+                ends[("input_bound", name)] = end
         return ends
 
     def filed(self, demonstrator: str) -> dict[Key, float]:
-        """The settings in the parameter files, bounds by side and as one."""
+        """The settings in the parameter files."""
         process, gains = self.any_params.process, next(iter(self.cases(demonstrator).values())).demonstrator.model_dump()
         values = {TIME: process.sampling_time}
-        for index, name in enumerate(process.manipulated):
-            values |= {("input_low", name): process.input_low[index], ("input_high", name): process.input_high[index]}
-            values[("input_bound", name)] = process.input_high[index]
+        for name, low, high in zip(process.manipulated, process.input_low, process.input_high, strict=True):
+            values |= {("input_low", name): low, ("input_high", name): high, ("input_bound", name): high}
         return values | {(kind, loop): gains[kind][i] for kind in GAINS for i, loop in enumerate(process.controlled)}
 
-    def problem(self, demonstrator: str, *settings: str, reading: Reading = READINGS[0], overdamped: bool | None = None) -> Problem:
-        """These settings and the gains of a demonstrator, to be fitted to its tables."""
+    def problem(self, demonstrator: str, shared: bool = False, reading: Reading = MAIN, overdamped: bool | None = None) -> Problem:
+        """The gains of a demonstrator, and what all share if asked for, to be fitted to its tables."""
         cases, options = self.cases(demonstrator), self.session.identification
         held = demonstrator == self.second if overdamped is None else overdamped
         return Problem(
             cases=cases,
             published={case: self.session.published[case].expert for case in cases},
             sampling_error=self.sampling_error,
-            free=self.ends(*settings, *GAINS),
+            free={**(self.shared_ends(reading) if shared else {}), **self.gain_ends()},
             seed=self.session.seed,
             reading=reading,
             overshoot_unit=options.overshoot_unit if held else None,
@@ -88,15 +92,14 @@ class Study:
 
     def joint(self) -> Problem:
         """Sampling time, bounds and gains of the first demonstrator."""
-        return self.problem(self.first, TIME[0], "input_bound")
+        return self.problem(self.first, shared=True)
 
     def best(self, problem: Problem, fits: Sequence[Fit]) -> Fit:
-        """The best of several fits, polished on many draws."""
-        return polish(problem, fits[0].z, self.session.scale_params.iterations, self.session.scale_params.draws_final)
+        """The best of several fits, polished on many draws to a finer tolerance."""
+        scale = self.session.scale_params
+        return polish(problem, fits[0].z, scale.iterations, scale.draws_final, FINAL_TOLERANCE)
 
-    def compared(
-        self, case: int, values: Values, n_trajectories: int, purpose: str, reading: Reading = READINGS[0]
-    ) -> pd.DataFrame:
+    def compared(self, case: int, values: Values, n_trajectories: int, purpose: str, reading: Reading = MAIN) -> pd.DataFrame:
         """The features of a case's demonstrator beside its published row.
 
         Columns: table, feature, published, simulated, deviation (in sampling errors), relative_error.
@@ -118,18 +121,23 @@ class Study:
 
 
 def study(session: IdentificationSession) -> Study:
-    """The sampling errors of the published rows: those of the demonstrators in the parameter files."""
+    """What every fit starts from."""
+    return Study(session, sampling_errors(session, MAIN))
+
+
+def sampling_errors(session: IdentificationSession, reading: Reading) -> dict[int, Vector]:
+    """The sampling errors of the published rows: those of the demonstrators in the parameter files, under a reading."""
     errors = {}
     for case, params in session.params.items():
         draws = stream(session.seed, case, "sampling error")
-        simulated = simulate(params, {}, READINGS[0], session.scale_params.draws_final, draws)
+        simulated = simulate(params, {}, reading, session.scale_params.draws_final, draws)
         errors[case] = simulated.sampling_error(session.identification.sample)
-    return Study(session, errors)
+    return errors
 
 
 def rows_table(study: Study) -> pd.DataFrame:
     """What is fitted: the published expert rows, each with its sampling error; a column for each feature."""
-    rows = {}
+    rows: dict[tuple[str, str], Sequence[float] | Vector] = {}
     for case, row in study.session.published.items():
         rows[(f"Table {row.table}", "published")] = row.expert
         rows[(f"Table {row.table}", "sampling error")] = study.sampling_error[case]
@@ -147,70 +155,53 @@ def fits_table(fits: Mapping[str, Sequence[Fit]]) -> pd.DataFrame:
 
 
 def compare_readings(study: Study, joint: Fit, second: Fit) -> pd.DataFrame:
-    """The loss and the mean relative error of every reading, each at its own best settings.
+    """Every reading at its own best settings. Columns: reading; loss and mean relative error by table; then the settings shared.
 
-    The first demonstrator is fitted with sampling time and bounds, the second at those. Tables are named by their numbers.
+    The first demonstrator is fitted with sampling time and bounds, the second at those. A reading may change the sampling errors
+    s of the rows: its loss then counts 2 log(s / s of the main reading) for every row, as a normal likelihood does.
     """
     session, scale, manipulated = study.session, study.session.scale_params, study.any_params.process.manipulated
+    start = {**study.filed(study.first), **joint.settings}
     rows = []
     for reading in READINGS:
-        bounds = ("input_bound",) if reading.symmetric_bounds else ("input_low", "input_high")
-        sides = {
-            (side, name): sign * joint.settings[("input_bound", name)]
-            for side, sign in (("input_low", -1), ("input_high", 1))
-            for name in manipulated
-        }
-        problem = study.problem(study.first, TIME[0], *bounds, reading=reading)
-        found = refit(problem, {**sides, **joint.settings}, scale)
+        errors = sampling_errors(session, reading)
+        problem = replace(study.problem(study.first, shared=True, reading=reading), sampling_error=errors)
+        found = refit(problem, start, scale)
         shared = {key: value for key, value in found.settings.items() if key[0] not in GAINS}
-        other = replace(study.problem(study.second, reading=reading), fixed=shared)
+        other = replace(study.problem(study.second, reading=reading), fixed=shared, sampling_error=errors)
         row: dict[str, object] = {"reading": reading.name}
         for target, best in ((problem, found), (other, refit(other, second.settings, scale))):
             tables = [study.compared(case, best.settings, scale.draws, "readings", reading) for case in target.cases]
-            row |= {f"loss_{'_'.join(str(session.published[case].table) for case in target.cases)}": best.loss}
+            wider = sum(2 * np.log(errors[case] / study.sampling_error[case]).sum() for case in target.cases)
+            row["loss_" + "_".join(str(session.published[case].table) for case in target.cases)] = best.loss + wider
             row |= {f"error_{table['table'].iloc[0]}": table["relative_error"].abs().mean() for table in tables}
         row["sampling_time"] = shared[TIME]
         for name in manipulated:
-            bound = shared.get(("input_bound", name), float("nan"))
+            bound = shared.get(("input_bound", name), np.nan)
             row |= {f"low {name}": shared.get(("input_low", name), -bound), f"high {name}": shared.get(("input_high", name), bound)}
         rows.append(row)
     return pd.DataFrame(rows)
 
 
 def dispersion(study: Study, joint: Fit, second: Fit) -> float:
-    """The loss per degree of freedom of the best fits: one if only the sampling error of the rows kept the loss from zero."""
+    """The least loss a row: about one, or less, if only the sampling error of the rows kept the loss from zero."""
     rows = sum(len(study.sampling_error[case]) for case in study.session.params)
-    settings = len(study.joint().free) + len(study.problem(study.second).free)
-    return max(1.0, (joint.loss + second.loss) / max(1, rows - settings))
+    return max(1.0, (joint.loss + second.loss) / rows)
 
 
 def profiles(study: Study, joint: Fit, gains: Mapping[str, Fit], rise: float) -> dict[str, Profile]:
-    """The profiles of all settings, by name: sampling time and bounds, each side of the bounds, and the gains.
+    """The profiles of all settings, by name.
 
-    Sampling time and bounds: all else is fitted again to the first demonstrator's tables. A side of a bound: the gains of both are
-    fitted again to all tables, with sampling time and other bounds as in the parameter files. A gain: the same demonstrator's
-    other gains are fitted again, with sampling time and bounds as in the files.
+    Sampling time and bounds: all else is fitted again to the first demonstrator's tables. A gain: the same demonstrator's other
+    gains are fitted again, with sampling time and bounds as in the parameter files.
     """
     scale = study.session.scale_params
+    plans = [("", study.joint(), joint, list(study.shared_ends()))]
+    plans += [(f"{name}.", study.problem(name), best, list(study.gain_ends())) for name, best in gains.items()]
     found: dict[str, Profile] = {}
-
-    def add(name: str, problems: list[Problem], fits: list[Fit], key: Key, end: float) -> None:
-        polished = [
-            polish(problem, problem.position(best.settings), scale.iterations, scale.draws)
-            for problem, best in zip(problems, fits, strict=True)
-        ]
-        found[name] = profile(problems, polished, key, end, rise, scale)
-
-    problem = study.joint()
-    for key, end in study.ends(TIME[0], "input_bound").items():
-        add(" ".join(key), [problem], [joint], key, end)
-    at_files = {name: study.problem(name) for name in gains}
-    for key, end in study.ends("input_low", "input_high").items():
-        value = {key: study.filed(study.first)[key]}
-        add(" ".join(key), [problem.holding(value) for problem in at_files.values()], list(gains.values()), key, end)
-    for name, problem in at_files.items():
-        for key, end in study.ends(*GAINS).items():
-            add(f"{name}.{key[0]} {key[1]}", [problem], [gains[name]], key, end)
+    for prefix, problem, best, keys in plans:
+        polished = polish(problem, problem.position(best.settings), scale.iterations, scale.draws)
+        found |= {f"{prefix}{key[0]} {key[1]}": profile(problem, polished, key, rise, scale) for key in keys}
     return found
 
 
@@ -252,34 +243,19 @@ def predictions(study: Study, gains: Mapping[str, Fit]) -> pd.DataFrame:
 def settings_table(study: Study, joint: Fit, gains: Mapping[str, Fit], found: Mapping[str, Profile], rise: float) -> pd.DataFrame:
     """What was found. Columns: setting, component, value, low, high, identified, in_parameter_files.
 
-    From low to high the loss lies no more than `rise` above its least.
+    From low to high the loss lies no more than `rise` above its least. Identified: neither end lies further from the value than a
+    share of it.
     """
-    rows = []
-    named = {
-        f"{key[0]} {key[1]}": (key, joint.settings[key], study.filed(study.first)[key])
-        for key in study.ends(TIME[0], "input_bound")
-    }
-    for key in study.ends("input_low", "input_high"):
-        name = " ".join(key)
-        one, filed = found[name], study.filed(study.first)[key]
-        named[name] = (key, float(one.grid[one.losses.argmin()]), filed)
-    for demonstrator, best in gains.items():
-        filed_gains = study.filed(demonstrator)
-        for key in study.ends(*GAINS):
-            named[f"{demonstrator}.{key[0]} {key[1]}"] = (key, best.settings[key], filed_gains[key])
-    share = study.session.identification.identified
-    for name, (key, value, filed) in named.items():
-        low, high = found[name].interval(rise)
-        identified = max(abs(value - low), abs(high - value)) <= share * abs(value)
-        rows.append(
-            {
-                "setting": name.removesuffix(f" {key[1]}"),
-                "component": key[1],
-                "value": value,
-                "low": low,
-                "high": high,
-                "identified": "yes" if identified else "no",
-                "in_parameter_files": filed,
-            }
-        )
-    return pd.DataFrame(rows)
+    share, rows = study.session.identification.identified, []
+    sources = [("", joint, study.first, study.shared_ends())]
+    sources += [(f"{name}.", best, name, study.gain_ends()) for name, best in gains.items()]
+    for prefix, best, demonstrator, keys in sources:
+        filed = study.filed(demonstrator)
+        for key in keys:
+            value = best.settings[key]
+            ends = found[f"{prefix}{key[0]} {key[1]}"].interval(rise)
+            low, high = min(*ends, value), max(*ends, value)  # the profile has fewer draws than the value
+            identified = max(abs(value - low), abs(high - value)) <= share * abs(value)
+            rows.append([prefix + key[0], key[1], value, low, high, "yes" if identified else "no", filed[key]])
+    columns = ["setting", "component", "value", "low", "high", "identified", "in_parameter_files"]
+    return pd.DataFrame(rows, columns=columns)

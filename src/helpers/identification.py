@@ -21,9 +21,10 @@ from helpers.readings import MAIN, Key, Reading, Values, Vector, simulate
 SHARED = ("sampling_time", "input_bound", "input_low", "input_high")  # of all controllers; none can be zero
 LEAST = 0.1  # lower end of the search for what cannot be zero, in the units of the search
 WORST = 1.0e4  # sampling errors; an unstable loop has no finite features
-SPREAD = 0.3  # first standard deviation of CMA-ES, in the units of the search
-STARTS = (0.15, 0.75)  # where random starts lie, in the units of the search
-POPULATION = 24  # of CMA-ES, more than twice its default: fewer starts end in a side valley or on a plateau
+SPREAD = 0.1  # first standard deviation of CMA-ES, in the units of the search
+STARTS = (0.1, 0.8)  # where random points lie, in the units of the search
+SCREENED = 1 / 6  # share of the evaluations that a start spends on random points, to begin at the best of them
+POPULATION = 16  # of CMA-ES, twice its default for six settings: fewer starts end in a side valley
 DIFFERENCE = 3.0e-3  # relative step of the slopes of the least squares; smaller ones meet the kinks of single trajectories
 FIRST_STEP, GROWTH = 0.015, 1.9  # steps of a profile, in the units of the search
 
@@ -129,12 +130,14 @@ def polish(problem: Problem, start: Vector, iterations: int, n_trajectories: int
 
 
 def fit(problem: Problem, scale: IdentificationScaleParams) -> list[Fit]:
-    """The fits from random starts, best first."""
+    """The fits from random starts, best first. A start is the best of many random points."""
     fits = []
     for start in range(scale.starts):
         generator = np.random.default_rng([problem.seed, start])
-        begin = generator.uniform(*STARTS, len(problem.free))
-        found = search(problem, begin, scale.evaluations, scale.draws_search, generator)
+        n_points = round(SCREENED * scale.evaluations)
+        points = generator.uniform(*STARTS, (n_points, len(problem.free)))
+        begin = min(points, key=lambda z: problem.loss(z, scale.draws_search))
+        found = search(problem, begin, scale.evaluations - n_points, scale.draws_search, generator)
         fits.append(polish(problem, found, scale.iterations, scale.draws))
     return sorted(fits, key=lambda found: found.loss)
 

@@ -74,6 +74,7 @@ def project(monkeypatch, tmp_path):
         results / "paper/seed_0/case_1/notebooks/02_offline_irl_improved.ipynb": "02",
         results / "paper/seed_0/case_1/notebooks/02_offline_irl_printed.ipynb": "02 printed",
         results / "paper/seed_0/case_3/notebooks/01_demonstrations.ipynb": "01",
+        results / "paper/seed_0/case_3/notebooks/.01_demonstrations.123.ipynb": "what a killed run left",
         results / "paper/seed_1/case_3/notebooks/01_demonstrations.ipynb": "01 of another seed",
         tmp_path / "README.md": README,
     }

@@ -106,8 +106,8 @@ def collect(root: Path, params_root: Path, scale: str, cases: tuple[int, ...], n
                 frames.append(scores.assign(case=case, seed=seed, stage=scores["stage"].map(names)).dropna(subset="stage"))
     seeds = pd.concat(frames, ignore_index=True)[["case", "seed", "stage", "metric", "value"]]
     features = feature_names(next(iter(params.values())).process.controlled)
-    inferred = root / scale / "seed_0" / INFERRED
     seeds = pd.concat([seeds, scorecard.relative(seeds, published, features)], ignore_index=True)
+    inferred = root / scale / "seed_0" / INFERRED
     return Results(
         scale=scale,
         params=params,

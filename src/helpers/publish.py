@@ -76,7 +76,7 @@ def time_by_stage(time: pd.DataFrame) -> str:
     wide = time.pivot_table(index="stage", columns="case", values="seconds")
     wide.columns = [f"case {case}, s" for case in wide.columns]
     cells = wide.map(lambda seconds: "–" if pd.isna(seconds) else f"{seconds:.0f}").reset_index()
-    return f"Seconds inside each stage's notebook, one seed, two stages at a time:\n\n{cells.to_markdown(index=False)}"
+    return f"Seconds inside each stage's notebook, medians over seeds, two stages at a time:\n\n{cells.to_markdown(index=False)}"
 
 
 def fill(text: str, block: str, content: str) -> str:
@@ -113,7 +113,7 @@ def main() -> int:
         copy(LATEST / part, partial / part)
     (partial / "notebooks").mkdir()
     first = RESULTS / latest["scale"] / f"seed_{latest['seeds'][0]}"
-    for path in sorted(first.glob("case_*/notebooks/*.ipynb")):
+    for path in sorted(first.glob("case_*/notebooks/[!.]*.ipynb")):
         case = path.parents[1].name
         shutil.copy2(path, partial / "notebooks" / f"{path.stem.removesuffix('_improved')}_{case}.ipynb")
     shutil.copy2(LATEST / "notebooks/05_report.ipynb", partial / "notebooks")

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 from torch.nn.utils import parameters_to_vector
 
-from helpers.lstm import Tape, stack, stacked
+from helpers.lstm import Tape, stack, stacked, step
 from helpers.policy import RELU6_TOP, LSTMPolicy
 from helpers.task import ControlTask
 from helpers.trajectories import Trajectories
@@ -26,8 +26,9 @@ class Layer:
         self.n_inputs = inputs.shape[1]
         self.weight = weight
         self.tape = Tape.blank(len(inputs), weight, inputs.shape[-1])
-        for t, x in enumerate(inputs):
-            self.tape.step(t, x, weight)
+        self.tape.inputs.copy_(inputs)
+        for moment in self.tape.moments[: len(inputs)]:
+            step(moment, weight)
         gates = self.tape.gates
         slope = gates * (1 - gates)
         width = len(weight) // 4

@@ -1,6 +1,10 @@
 """Process and controller in closed loop: batched episodes."""
 
+from collections.abc import Callable
+from functools import partial
+
 import torch
+from torch import Tensor
 
 from helpers.controllers import Controller
 from helpers.process import Process
@@ -21,21 +25,25 @@ def rollout(
     meets do not depend on the controller, so that two controllers can be compared on the same draws.
     """
     n_steps = task.n_steps
-    dtype = task.set_point.dtype
-    start = torch.randn(n_trajectories, process.n_states, generator=generator, dtype=dtype)
-    disturbance = torch.randn(n_steps, n_trajectories, process.n_states, generator=generator, dtype=dtype)
-    observation = torch.randn(n_steps + 1, n_trajectories, process.n_outputs, generator=generator, dtype=dtype)
-    x = torch.empty(n_steps + 1, n_trajectories, process.n_states, dtype=dtype)
-    y = torch.empty(n_steps + 1, n_trajectories, process.n_outputs, dtype=dtype)
-    u = torch.empty(n_steps, n_trajectories, process.n_inputs, dtype=dtype)
-    command = torch.empty_like(u)
-    x[0] = task.initial_mean + task.initial_std * start
-    y[0] = process.observe(x[0], observation[0])
+
+    def batch(n_times: int, n_variables: int, fill: Callable[..., Tensor]) -> Tensor:
+        # In memory the trajectories come last: a step then works on long rows, not on many short ones.
+        return fill((n_times, n_variables, n_trajectories), dtype=task.set_point.dtype).mT
+
+    draw = partial(torch.randn, generator=generator)
+    start = batch(1, process.n_states, draw)[0]
+    disturbance = batch(n_steps, process.n_states, draw).unbind(0)
+    noise = batch(n_steps + 1, process.n_outputs, draw).unbind(0)
+    x, y = batch(n_steps + 1, process.n_states, torch.empty), batch(n_steps + 1, process.n_outputs, torch.empty)
+    u, command = batch(n_steps, process.n_inputs, torch.empty), batch(n_steps, process.n_inputs, torch.empty)
+    x[0] = state = task.initial_mean + task.initial_std * start
+    y[0] = observation = process.observe(state, noise[0])
     with torch.no_grad():
         memory = controller.start(n_trajectories, n_steps, generator)
-        for t in range(n_steps):
-            command[t], memory = controller.act(y[t], memory)
-            torch.clamp(command[t], task.input_low, task.input_high, out=u[t])
-            x[t + 1] = process.step(x[t], u[t], disturbance[t])
-            y[t + 1] = process.observe(x[t + 1], observation[t + 1])
+        for t, (applied, asked) in enumerate(zip(u.unbind(0), command.unbind(0), strict=True)):
+            action, memory = controller.act(observation, memory)
+            asked.copy_(action)
+            torch.clamp(asked, task.input_low, task.input_high, out=applied)
+            x[t + 1] = state = process.step(state, applied, disturbance[t])
+            y[t + 1] = observation = process.observe(state, noise[t + 1])
     return Trajectories(x, y, u, command)

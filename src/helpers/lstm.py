@@ -100,6 +100,8 @@ class Tape:
 
     def part(self, rows: slice) -> "Tape":
         """The tape of some neighbouring trajectories, in the same memory."""
+        if len(range(self.gates.shape[-1])[rows]) == self.gates.shape[-1]:
+            return self
         return Tape.over(*(entry[..., rows] for entry in (self.signals, self.gates, self.cells, self.squashed)))
 
     @property
@@ -173,14 +175,19 @@ class Unroll(torch.autograd.Function):
         (weight,) = ctx.saved_tensors
         tape = ctx.tape
         width, n_steps = tape.cells.shape[1], len(tape.gates)
-        recurrent = weight[:, -width:].T.contiguous()
-        d_later = torch.zeros_like(d_hidden[0], memory_format=torch.contiguous_format)  # the part of d_h from step t + 1
+        # Back through [x, h] or through h alone: the lowest layer's inputs need no gradient.
+        below = [weight[:, : ctx.n_inputs]] if ctx.needs_input_grad[0] else []
+        back = torch.cat([*below, weight[:, -width:]], dim=1).T.contiguous()
+        d_signals = weight.new_zeros(n_steps + 1, len(back), d_hidden.shape[-1])
+        d_recurrent = d_signals[:, -width:].unbind(0)
+        d_later = d_recurrent[n_steps]  # the part of d_h that comes from step t + 1
         d_cell, d_squashed = torch.zeros_like(d_later), torch.empty_like(d_later)
         d_weight = torch.zeros_like(weight)
         d_gates = weight.new_empty(4 * width, d_later.shape[1])  # in the gates after their activation
         d_entry, d_forget, d_exit, d_candidate = d_gates.split(width)
         d_logistic = d_gates[: 3 * width]
-        for moment, d_now in zip(reversed(tape.moments[:n_steps]), reversed(d_hidden.unbind(0)), strict=True):
+        steps = zip(tape.moments, d_hidden.unbind(0), d_signals.unbind(0), d_recurrent, strict=False)
+        for moment, d_now, d_signal, d_before in reversed(list(steps)[:n_steps]):
             d_h = d_later.add_(d_now)
             torch.mul(d_h, moment.exit, out=d_squashed)
             d_cell += tanh_backward(d_squashed, moment.squashed, grad_input=d_squashed)
@@ -191,8 +198,8 @@ class Unroll(torch.autograd.Function):
             d_cell *= moment.forget
             sigmoid_backward(d_logistic, moment.logistic, grad_input=moment.logistic)
             tanh_backward(d_candidate, moment.candidate, grad_input=moment.candidate)
-            torch.mm(recurrent, moment.gates, out=d_later)
+            torch.mm(back, moment.gates, out=d_signal)
+            d_later = d_before
             # The copy pays: a product is twice as fast where both matrices have their rows in a piece.
             d_weight.addmm_(moment.gates, moment.signal.T.contiguous())
-        d_inputs = weight[:, : ctx.n_inputs].T @ tape.gates if ctx.needs_input_grad[0] else None
-        return d_inputs, d_weight, None, None
+        return d_signals[:-1, :-width] if ctx.needs_input_grad[0] else None, d_weight, None, None

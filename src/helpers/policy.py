@@ -154,7 +154,9 @@ class LSTMPolicy(nn.Module):
             tapes = [Tape.blank(*u.shape[:1], weight.detach(), u.shape[1], old) for weight, old in zip(weights, lent, strict=True)]
         for weight, tape in zip(weights, tapes, strict=True):
             signal = functional.leaky_relu(Unroll.apply(signal, weight, tape, recorded), self.params.leaky_slope)
-        return self.scale((self.output.weight @ signal + self.output.bias[:, None]).mT, task)
+        # A batch of products: `@` would copy the signal of all steps to make one product of them.
+        output = torch.baddbmm(self.output.bias[:, None], self.output.weight.expand(len(signal), -1, -1), signal)
+        return self.scale(output.mT, task)
 
     def log_probability(self, y: Tensor, u: Tensor, command: Tensor, task: ControlTask) -> Tensor:
         """ln pi(command_t | y_0..y_t, u_0..u_{t-1}), shape (T, K): the term of Eq. 3.2.3.
@@ -170,7 +172,9 @@ class PolicyMemory:
 
     step: int
     tapes: list[Tape]
-    seen: Tensor  # the present observation and the input before it, shape (n_y + n_u, K)
+    seen: Tensor  # the present observation above the input before it, shape (n_y + n_u, K)
+    observed: Tensor  # the two parts of `seen`
+    applied: Tensor
     exploration: tuple[Tensor, ...]  # standard normal, (n_u, K) for each step; empty without exploration
 
 
@@ -205,12 +209,12 @@ class PolicyController:
         self.tapes = tapes if self.recording else []
         shape = (n_steps, n_inputs, n_trajectories)
         noise = torch.randn(shape, generator=generator, dtype=like.dtype).unbind(0) if self.exploring else ()
-        return PolicyMemory(0, tapes, like.new_zeros(len(self.scaling.centre), n_trajectories), noise)
+        seen = like.new_zeros(len(self.scaling.centre), n_trajectories)
+        return PolicyMemory(0, tapes, seen, seen[:-n_inputs], seen[-n_inputs:], noise)
 
     def act(self, observation: Tensor, memory: PolicyMemory) -> tuple[Tensor, PolicyMemory]:
         """The policy's command for one sample; the memory is updated in place."""
-        observed, applied = memory.seen.split([len(memory.seen) - len(self.low), len(self.low)])
-        observed.copy_(observation.T)
+        memory.observed.copy_(observation.T)
         moments = [tape.at(memory.step) for tape in memory.tapes]
         torch.sub(memory.seen, self.scaling.centre, out=moments[0].inputs).mul_(self.scaling.gain)
         for layer, (moment, weight) in enumerate(zip(moments, self.layers, strict=True)):
@@ -220,6 +224,6 @@ class PolicyController:
         output = torch.addmm(self.output_bias, self.output_weight, signal)
         mean, std = torch.addcmul(self.scaling.shift, functional.relu6(output), self.scaling.factor).chunk(2)
         command = torch.addcmul(mean, std, memory.exploration[memory.step]) if memory.exploration else mean
-        torch.clamp(command, self.low, self.high, out=applied)
+        torch.clamp(command, self.low, self.high, out=memory.applied)
         memory.step += 1
         return command.T, memory

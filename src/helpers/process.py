@@ -45,8 +45,7 @@ class LinearProcess:
         # One step as two products, so that the rollout does no work twice: x + h dt = (I + A dt) x + (B dt) u.
         self.state_step = torch.eye(self.n_states, dtype=dtype) + self.drift_state * self.sampling_time
         self.input_step = self.drift_input * self.sampling_time
-        self._disturbance_step = (self.disturbance_gain * self.sampling_time**0.5)[:, None]
-        self._observation_noise = self.observation_noise[:, None]
+        self._disturbance_step = self.disturbance_gain * self.sampling_time**0.5
 
     def drift(self, x: Tensor, u: Tensor) -> Tensor:
         """h(x, u) of Eq. 4.1.3b, shape (K, n_x), per unit of time."""
@@ -58,13 +57,11 @@ class LinearProcess:
 
     def step(self, x: Tensor, u: Tensor, noise: Tensor) -> Tensor:
         """The next state by Euler-Maruyama, Eq. 4.1.3a: x + h(x, u) dt + delta(x) sqrt(dt) noise."""
-        # On the transposes: a rollout keeps its trajectories last in memory.
-        kick = torch.mul(x.T, noise.T).mul_(self._disturbance_step)
-        return kick.addmm_(self.state_step, x.T).addmm_(self.input_step, u.T).T
+        return (x * noise).mul_(self._disturbance_step).addmm_(x, self.state_step.T).addmm_(u, self.input_step.T)
 
     def observe(self, x: Tensor, noise: Tensor) -> Tensor:
         """The observation of Eq. 4.1.4b: each output is read with a relative error."""
-        return torch.addcmul(x.T, x.T * noise.T, self._observation_noise).T
+        return torch.addcmul(x, x * noise, self.observation_noise)
 
 
 def linearised_balances(groups: BalanceParams) -> tuple[list[list[float]], list[list[float]]]:

@@ -1,8 +1,5 @@
 """Process and controller in closed loop: batched episodes."""
 
-from collections.abc import Callable
-from functools import partial
-
 import torch
 from torch import Tensor
 
@@ -26,24 +23,21 @@ def rollout(
     """
     n_steps = task.n_steps
 
-    def batch(n_times: int, n_variables: int, fill: Callable[..., Tensor]) -> Tensor:
+    def draw(n_times: int, n_variables: int) -> tuple[Tensor, ...]:
         # In memory the trajectories come last: a step then works on long rows, not on many short ones.
-        return fill((n_times, n_variables, n_trajectories), dtype=task.set_point.dtype).mT
+        return torch.randn(n_times, n_variables, n_trajectories, generator=generator, dtype=task.set_point.dtype).mT.unbind(0)
 
-    draw = partial(torch.randn, generator=generator)
-    start = batch(1, process.n_states, draw)[0]
-    disturbance = batch(n_steps, process.n_states, draw).unbind(0)
-    noise = batch(n_steps + 1, process.n_outputs, draw).unbind(0)
-    x, y = batch(n_steps + 1, process.n_states, torch.empty), batch(n_steps + 1, process.n_outputs, torch.empty)
-    u, command = batch(n_steps, process.n_inputs, torch.empty), batch(n_steps, process.n_inputs, torch.empty)
-    x[0] = state = task.initial_mean + task.initial_std * start
-    y[0] = observation = process.observe(state, noise[0])
+    (start,) = draw(1, process.n_states)
+    disturbance, noise = draw(n_steps, process.n_states), draw(n_steps + 1, process.n_outputs)
+    x = [task.initial_mean + task.initial_std * start]
+    y = [process.observe(x[0], noise[0])]
+    u, command = [], []
     with torch.no_grad():
         memory = controller.start(n_trajectories, n_steps, generator)
-        for t, (applied, asked) in enumerate(zip(u.unbind(0), command.unbind(0), strict=True)):
-            action, memory = controller.act(observation, memory)
-            asked.copy_(action)
-            torch.clamp(asked, task.input_low, task.input_high, out=applied)
-            x[t + 1] = state = process.step(state, applied, disturbance[t])
-            y[t + 1] = observation = process.observe(state, noise[t + 1])
-    return Trajectories(x, y, u, command)
+        for t in range(n_steps):
+            asked, memory = controller.act(y[t], memory)
+            command.append(asked)
+            u.append(torch.clamp(asked, task.input_low, task.input_high))
+            x.append(process.step(x[t], u[t], disturbance[t]))
+            y.append(process.observe(x[t + 1], noise[t + 1]))
+    return Trajectories(*(torch.stack([entry.T for entry in signal]).mT for signal in (x, y, u, command)))

@@ -43,6 +43,8 @@ def execute(notebook: str, output: Path, parameters: dict[str, Any]) -> None:
     # kernel's sockets avoids the race. Its path must stay short: socket names are limited to about 100 characters.
     with tempfile.TemporaryDirectory(prefix="hk") as sockets:
         config = Config()
+        # Papermill has every output by the time it stops the kernel, so the kernel need not take itself apart first.
+        config.NotebookClient.shutdown_kernel = "immediate"
         if os.name == "posix":
             config.KernelManager.transport = "ipc"
             config.KernelManager.ip = str(Path(sockets) / "k")

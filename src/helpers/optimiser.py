@@ -23,7 +23,7 @@ DEFAULTS: Any = {
 class Adam:
     """The optimiser of Kingma and Ba (2015) by torch's own functional `adam`, at torch's defaults.
 
-    Its interface is the part of `torch.optim.Optimizer` that learning uses; its numbers are those of `torch.optim.Adam(fused=True)`.
+    Its interface is the part of `torch.optim.Optimizer` that learning uses; its numbers are those of torch's class with `fused`.
     """
 
     def __init__(self, parameters: Iterable[nn.Parameter], lr: float) -> None:

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from scipy.sparse.linalg import LinearOperator, cg
 from torch import Tensor
 from torch.nn import functional
 from torch.nn.utils import parameters_to_vector
@@ -111,6 +110,9 @@ def precondition(policy: LSTMPolicy, batch: Trajectories, task: ControlTask, tru
     By the quadratic model, a step along it changes the policy by a divergence of `trust_region` nats a decision, less what
     damping takes (Schulman et al. 2015, Appendix C). There is no line search.
     """
+    # Every stage that learns imports this module, few take the natural gradient, and scipy's solvers take long to load.
+    from scipy.sparse.linalg import LinearOperator, cg  # noqa: PLC0415
+
     parameters = list(policy.parameters())
     gradient = parameters_to_vector([parameter.grad for parameter in parameters if parameter.grad is not None])
     product = fisher_product(policy, batch.y[:, :EPISODES], batch.u[:, :EPISODES], task)

@@ -151,7 +151,7 @@ class LSTMPolicy(nn.Module):
             previous = torch.cat([torch.zeros_like(u[:1]), u[:-1]])
             signal = self.network_inputs(y[: len(u)], previous, task).mT
             lent: Sequence[Tape | None] = tapes or [None] * len(weights)
-            tapes = [Tape.blank(*u.shape[:1], weight.detach(), u.shape[1], old) for weight, old in zip(weights, lent, strict=True)]
+            tapes = [Tape.blank(len(u), weight.detach(), u.shape[1], old) for weight, old in zip(weights, lent, strict=True)]
         for weight, tape in zip(weights, tapes, strict=True):
             signal = functional.leaky_relu(Unroll.apply(signal, weight, tape, recorded), self.params.leaky_slope)
         # A batch of products: `@` would copy the signal of all steps to make one product of them.

@@ -19,6 +19,7 @@ from helpers.rollout import rollout
 from helpers.trajectories import Trajectories
 
 BLOCK = 1000  # episodes whose gradient is computed at once: more would only take memory
+FEW = 100  # episodes below which torch's own LSTM is faster than the gradient through time written out: 7 against 17 ms for 50
 Reward = Callable[[Trajectories], Tensor]  # rewards R_1..R_T, shape (T, K)
 
 
@@ -226,6 +227,8 @@ class Learner:
 
     def _distribution(self, batch: Trajectories, rows: slice, recorded: bool) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the present policy along some episodes."""
+        if not recorded and rows.stop - rows.start < FEW:
+            return self.policy(batch.y[:, rows], batch.u[:, rows], self.features.task)
         tapes = [tape.part(rows) for tape in self._tapes]
         return self.policy.unrolled(batch.y[:, rows], batch.u[:, rows], self.features.task, tapes, recorded)
 

@@ -20,8 +20,8 @@ tanh_backward = torch.ops.aten.tanh_backward.grad_input
 class Moment(NamedTuple):
     """Views of one step of a tape, made once: to cut them out anew at every step takes longer than what is done with them.
 
-    `signal` is [x_t, 1, h_{t-1}] and `inputs` its part x_t (n_in, K); `gates` are (4 n, K), `logistic` its part i_t, f_t, o_t, whose
-    parts are `entry`, `forget` and `exit`; `candidate` is g_t. The rest is c_{t-1}, c_t, tanh(c_t) and h_t, each (n, K).
+    `signal` is [x_t, 1, h_{t-1}] and `inputs` its part x_t (n_in, K); `gates` are (4 n, K), `logistic` their part i_t, f_t, o_t,
+    whose parts are `entry`, `forget` and `exit`; `candidate` is g_t. The rest is c_{t-1}, c_t, tanh(c_t) and h_t, each (n, K).
     """
 
     signal: Tensor
@@ -68,10 +68,23 @@ class Tape:
         moments = []
         for t in range(max(n_steps, 2)):
             now, after, row = t % (n_steps + 1), (t + 1) % (n_steps + 1), t % n_steps
-            hidden = signal[after][n_inputs + 1 :]
             entry, forget, exit_, candidate = gate[row].split(width)
-            gates = (gate[row], gate[row][: 3 * width], entry, forget, exit_, candidate)
-            moments.append(Moment(signal[now], signal[now][:n_inputs], *gates, cell[now], cell[after], tanh[row], hidden))
+            moments.append(
+                Moment(
+                    signal=signal[now],
+                    inputs=signal[now][:n_inputs],
+                    gates=gate[row],
+                    logistic=gate[row][: 3 * width],
+                    entry=entry,
+                    forget=forget,
+                    exit=exit_,
+                    candidate=candidate,
+                    cell_before=cell[now],
+                    cell=cell[after],
+                    squashed=tanh[row],
+                    hidden=signal[after][n_inputs + 1 :],
+                )
+            )
         return cls(signals, gates, cells, squashed, tuple(moments))
 
     @classmethod

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from helpers.artifacts import RECORD, ArtifactError, Stage
-from helpers.identity import changes, inputs
+from helpers.identity import UNKNOWN, changes, identity, inputs
 from helpers.sources import PROJECT
 
 COMMITTED = PROJECT / "notebooks/inputs"  # made at another commit, on another machine: only their parameters are compared
@@ -21,23 +21,24 @@ def check(stages: Sequence[Stage], folder: Path, params_root: Path) -> None:
         ArtifactError: in one sentence, which names the files that do not fit, and what has changed since they were made.
     """
     committed = folder.parent.resolve() == COMMITTED.resolve()
-    now: dict[tuple[str, int | None, str], dict[str, str]] = {}
     content = {stage.folder.relative_to(folder).as_posix(): stage.content for stage in stages}
+    now: dict[tuple[str, int | None, str], dict[str, str]] = {}
     stale: dict[str, list[str]] = {}
     for stage in stages:
         record, place = stage.record, stage.folder.relative_to(folder)
-        key = record.get("notebook", ""), record.get("case"), record.get("variant", "improved")
-        if not key[0]:
+        run = {name: record[name] for name in ("notebook", "case", "seed", "scale", "variant") if name in record}
+        if "notebook" not in run:
             raise ArtifactError(f"{stage.folder / RECORD}: this result does not say what made it; run it again")
+        key = run["notebook"], run.get("case"), run.get("variant", "improved")
         if key not in now:
             now[key] = inputs(key[0], params_root, folder.name, key[1], key[2])
         found = changes(record, now[key])
         if committed:
-            found = [name for name in found if name.startswith("params/")]
-        for name, read in record.get("upstream", {}).items():
-            source = (Path(place.parts[0]) / name).as_posix()
-            if content.get(source, read) != read:
-                found.append(source)
+            found = [name for name in found if name.startswith(("params/", UNKNOWN))]
+        upstream = {name: content.get(f"{place.parts[0]}/{name}", read) for name, read in record.get("upstream", {}).items()}
+        found += [f"{place.parts[0]}/{name}" for name, read in upstream.items() if record["upstream"][name] != read]
+        if not found and not committed and record.get("identity") != identity(run, now[key], upstream):
+            found = ["the record itself"]
         if found:
             stale.setdefault(", ".join(found), []).append(str(stage.folder / RECORD))
     if stale:

@@ -25,6 +25,7 @@ MORE_FILES = {
     "08_claims": ("experiments", "published"),
 }
 NOT_OF_RESULTS = ("checkpoint_interval",)  # settings that cannot change a number
+UNKNOWN = "everything (an older kind of record)"
 
 
 def versions() -> dict[str, str]:
@@ -70,7 +71,7 @@ def changes(record: Mapping[str, Any], made_from: Mapping[str, str]) -> list[str
     """What a result was made from that is otherwise now, by name; a record of an older kind has changed in everything."""
     before = record.get("inputs")
     if not isinstance(before, dict):
-        return ["everything (a record without an identity)"]
+        return [UNKNOWN]
     return sorted(name for name in {*before, *made_from} if before.get(name) != made_from.get(name))
 
 

@@ -27,8 +27,9 @@ from benchmarks.subjects import (
     PROJECT,
     Subject,
 )
-from helpers.artifacts import code_revision, versions
+from helpers.artifacts import code_revision
 from helpers.figures import INK, MUTED, WIDTH
+from helpers.identity import versions
 from helpers.tables import to_markdown
 
 COLUMNS = [

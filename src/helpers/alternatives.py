@@ -52,7 +52,8 @@ def feature_sets(prepared: Prepared) -> Scores:
     learner = Learner(policy, session.process, chosen, variant.learner, scale.episodes, n_epochs, generator)
     start = initial_weights(variant.weights, len(kept), session.dtype)[: len(kept)]
     known = prepared.demonstrations.features(chosen)
-    learned = maxent_irl(learner, known, start, variant.weights, n_epochs, scale.measured, ProgressBar(n_epochs, "Type I alone"))
+    bar, memory = ProgressBar(n_epochs, "Type I alone"), stages.memory(session, learner, known, start)
+    learned = maxent_irl(learner, known, start, variant.weights, n_epochs, scale.measured, bar, memory)
     expert = session.features.errors(stages.fresh_trajectories(session, session.expert)).mean(1)
     scores = {}
     started = stages.improve(session, copied(session, learned.policy), "x").policy

@@ -3,8 +3,9 @@
 import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from torch import Tensor
 from helpers.features import FeatureMap, accumulated_error, discounts, normalised_error
 from helpers.lstm import Tape
 from helpers.natural import precondition
+from helpers.optimiser import Adam
 from helpers.params import LearnerParams
 from helpers.policy import LSTMPolicy, PolicyController, entropy, log_density
 from helpers.process import Process
@@ -121,6 +123,26 @@ class EpochRecord:
     policy_std: float
 
 
+class Memory(Protocol):
+    """Where a training keeps its state, to go on from there after an interruption; see `checkpoint`."""
+
+    def recall(self) -> dict[str, Any] | None:
+        """The last state kept, if there is one."""
+
+    def keep(self, state: Callable[[], dict[str, Any]], finished: bool = False) -> None:
+        """Keep a state, if it is time to; only then is it asked for."""
+
+
+class NoMemory:
+    """A training that starts anew after an interruption."""
+
+    def recall(self) -> None:
+        """Nothing."""
+
+    def keep(self, state: Callable[[], dict[str, Any]], finished: bool = False) -> None:
+        """Nothing is kept."""
+
+
 class Learner:
     """A policy under Algorithm 1: its optimiser, the running average of its weights and what learning has cost so far.
 
@@ -150,10 +172,29 @@ class Learner:
         self.total_epochs = total_epochs
         self.generator = generator
         # With the natural gradient, the learning rate is the share of the trust region that a step takes.
-        kind = torch.optim.Adam if params.trust_region is None else torch.optim.SGD
+        kind: type[Adam] | type[torch.optim.SGD] = Adam if params.trust_region is None else torch.optim.SGD
         self.optimiser = kind(policy.parameters(), lr=params.learning_rate_start)
         self.epochs = self.episodes = self.gradient_steps = 0
         self._tapes: list[Tape] = []
+
+    def state(self) -> dict[str, Any]:
+        """All that the next epochs depend on beside what the learner was made with; see `restore`."""
+        return {
+            "policy": self.policy.state_dict(),
+            "average": self.average.state_dict(),
+            "optimiser": self.optimiser.state_dict()["state"],
+            "generator": self.generator.get_state(),
+            "spent": [self.epochs, self.episodes, self.gradient_steps],
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from the state of a learner that was made alike: the next epochs are its next ones, to the last bit."""
+        self.policy.load_state_dict(state["policy"])
+        self.average.load_state_dict(state["average"])
+        moments = {int(index): entry for index, entry in state["optimiser"].items()}
+        self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": moments})
+        self.generator.set_state(state["generator"])
+        self.epochs, self.episodes, self.gradient_steps = state["spent"]
 
     def epoch(self, reward: Reward) -> EpochRecord:
         """One epoch: roll out, weigh, step. Raises TrainingError if the return or the gradient is not finite."""
@@ -259,21 +300,29 @@ def reinforce(
     n_epochs: int,
     patience: int = 0,
     report: Callable[[EpochRecord], None] = lambda record: None,
+    earlier: Sequence[EpochRecord] = (),
+    keep: Callable[[Sequence[EpochRecord]], None] = lambda records: None,
 ) -> list[EpochRecord]:
     """Algorithm 1: at most `n_epochs` epochs under one reward; `report` is called with the record of each.
 
     Early stopping: with `patience` > 0, stops once that many epochs in a row brought no better mean return.
+
+    Args:
+        earlier: records of the first of these epochs, where the learner has been through them already.
+        keep: called with all records after each epoch.
     """
-    records: list[EpochRecord] = []
-    best = 0
-    for _ in range(n_epochs):
+    records = list(earlier)
+    while len(records) < n_epochs and not (patience and records and _epochs_since_best(records) >= patience):
         records.append(learner.epoch(reward))
         report(records[-1])
-        if records[-1].mean_return >= records[best].mean_return:
-            best = len(records) - 1
-        if patience and len(records) - 1 - best >= patience:
-            break
+        keep(records)
     return records
+
+
+def _epochs_since_best(records: Sequence[EpochRecord]) -> int:
+    """How many epochs ago the mean return was best; of equals the last counts."""
+    best = max(range(len(records)), key=lambda index: (records[index].mean_return, index))
+    return len(records) - 1 - best
 
 
 def improve_online(
@@ -281,10 +330,36 @@ def improve_online(
     epochs: Sequence[int],
     betas: Sequence[float],
     report: Callable[[EpochRecord], None] = lambda record: None,
+    memory: Memory | None = None,
 ) -> list[EpochRecord]:
-    """Online learning, Section 5.1.2: rounds of Algorithm 1 under the tracking objective, each with its own beta."""
-    records: list[EpochRecord] = []
-    for n_epochs, beta in zip(epochs, betas, strict=True):
+    """Online learning, Section 5.1.2: rounds of Algorithm 1 under the tracking objective, each with its own beta.
+
+    With a memory it goes on where an interrupted run was.
+    """
+    memory = memory or NoMemory()
+    rounds = list(zip(epochs, betas, strict=True))
+    finished: list[EpochRecord] = []  # records of earlier rounds
+    started: list[EpochRecord] = []  # and of the interrupted one
+    first = 0
+    if (state := memory.recall()) is not None:
+        learner.restore(state["learner"])
+        first = state["round"]
+        finished, started = ([EpochRecord(**row) for row in state[name]] for name in ("finished", "started"))
+
+    def state_of(index: int, records: Sequence[EpochRecord]) -> dict[str, Any]:
+        return {
+            "learner": learner.state(),
+            "round": index,
+            "finished": [asdict(record) for record in finished],
+            "started": [asdict(record) for record in records],
+        }
+
+    def keep(index: int, records: Sequence[EpochRecord]) -> None:
+        memory.keep(partial(state_of, index, records))
+
+    for index, (n_epochs, beta) in list(enumerate(rounds))[first:]:
         tracking = partial(learner.features.tracking, beta=beta)
-        records += reinforce(learner, tracking, n_epochs, learner.params.patience, report)
-    return records
+        finished += reinforce(learner, tracking, n_epochs, learner.params.patience, report, started, partial(keep, index))
+        started = []
+    memory.keep(partial(state_of, len(rounds), []), finished=True)
+    return finished

@@ -8,7 +8,7 @@ from helpers import publish
 from helpers.publish import PublishError, check
 
 REVISION = "0123abcd" * 5
-GOOD = {"scale": "paper", "revision": REVISION, "revisions_of_stages": [REVISION], "seeds": [0, 1], "notebooks_changed_since": []}
+GOOD = {"scale": "paper", "revision": REVISION, "revisions_of_stages": [REVISION], "seeds": [0, 1], "missing_seeds": []}
 OTHER = "f" * 40
 
 
@@ -30,7 +30,7 @@ REFUSED = {
     ),
     "one stage of changed code": ({"revisions_of_stages": [REVISION, REVISION + "+changes"]}, None, REVISION, "+changes"),
     "a report of another commit": ({"revision": OTHER}, None, REVISION, OTHER),
-    "stages of other code": ({"notebooks_changed_since": ["02_offline_irl"]}, None, REVISION, "02_offline_irl"),
+    "seeds that failed": ({"missing_seeds": [3, 7]}, None, REVISION, "lacks the seeds 3, 7"),
     "another commit now": ({}, None, OTHER, OTHER),
     "no checkout": ({"revision": "unknown", "revisions_of_stages": ["unknown"]}, None, "unknown", "unknown"),
 }

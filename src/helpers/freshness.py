@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from helpers.artifacts import RECORD, ArtifactError, Stage
 from helpers.identity import UNKNOWN, changes, identity, inputs
@@ -26,7 +27,7 @@ def check(stages: Sequence[Stage], folder: Path, params_root: Path) -> None:
     stale: dict[str, list[str]] = {}
     for stage in stages:
         record, place = stage.record, stage.folder.relative_to(folder)
-        run = {name: record[name] for name in ("notebook", "case", "seed", "scale", "variant") if name in record}
+        run: dict[str, Any] = {name: record[name] for name in ("notebook", "case", "seed", "scale", "variant") if name in record}
         if "notebook" not in run:
             raise ArtifactError(f"{stage.folder / RECORD}: this result does not say what made it; run it again")
         key = run["notebook"], run.get("case"), run.get("variant", "improved")

@@ -17,11 +17,7 @@ from helpers.params import LEAF_KEYS, read_yaml
 from helpers.sources import PROJECT, code_behind
 
 PACKAGES = ("torch", "numpy", "scipy", "pandas", "cma", "safetensors", "sympy", "pydantic", "ruamel.yaml", "matplotlib", "seaborn")
-UNREAD = {  # sections of learning.yaml
-    "01_demonstrations": ("policy", "variants", "online"),
-    "02_offline_irl": ("online",),
-    "03_online_improvement": ("variants",),
-}
+RECORDING = "01_demonstrations"  # nothing is learned there
 OF_ALL_CASES = ("00_inferred_settings", "05_report")
 MORE_FILES = {
     "00_inferred_settings": ("identification", "published"),
@@ -101,7 +97,8 @@ def _read_by(
         if _is_trial(params_root, variant):
             base = str(read_yaml(params_root / "trials.yaml").get(variant, {}).get("base"))
         only = {"scales": scale, "variants": base}
-        values = {key: value for key, value in values.items() if key.split(".")[0] not in UNREAD.get(notebook, ())}
+        if notebook == RECORDING:
+            values = {key: value for key, value in values.items() if key.startswith("scales.")}
     elif name == "demonstrators":
         own = dict(_values(read_yaml(params_root / f"case_{case}.yaml"))).get("demonstrator")
         values = {key: value for key, value in values.items() if key.split(".")[0] == own}

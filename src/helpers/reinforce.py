@@ -13,6 +13,7 @@ from torch import Tensor
 from helpers.features import FeatureMap, accumulated_error, discounts, normalised_error
 from helpers.lstm import Tape
 from helpers.natural import precondition
+from helpers.optimiser import Adam
 from helpers.params import LearnerParams
 from helpers.policy import LSTMPolicy, PolicyController, entropy, log_density
 from helpers.process import Process
@@ -20,6 +21,7 @@ from helpers.rollout import rollout
 from helpers.trajectories import Trajectories
 
 BLOCK = 1000  # episodes whose gradient is computed at once: more would only take memory
+FEW = 100  # episodes below which torch's own LSTM is faster than the gradient through time written out: 7 against 17 ms for 50
 Reward = Callable[[Trajectories], Tensor]  # rewards R_1..R_T, shape (T, K)
 
 
@@ -170,7 +172,7 @@ class Learner:
         self.total_epochs = total_epochs
         self.generator = generator
         # With the natural gradient, the learning rate is the share of the trust region that a step takes.
-        kind = torch.optim.Adam if params.trust_region is None else torch.optim.SGD
+        kind: type[Adam] | type[torch.optim.SGD] = Adam if params.trust_region is None else torch.optim.SGD
         self.optimiser = kind(policy.parameters(), lr=params.learning_rate_start)
         self.epochs = self.episodes = self.gradient_steps = 0
         self._tapes: list[Tape] = []
@@ -238,38 +240,38 @@ class Learner:
         """
         params = self.params
         n_steps = params.passes * params.minibatches
+        edges = [self.n_episodes * part // params.minibatches for part in range(params.minibatches + 1)]
         drawn = None
         if n_steps > 1:
             with torch.no_grad():
-                drawn = log_density(batch.command, *self._distribution(batch, slice(None), self._tapes))
+                drawn = log_density(batch.command, *self._distribution(batch, slice(0, self.n_episodes), bool(self._tapes)))
         for step in range(n_steps):
-            rows = range(self.n_episodes)[step % params.minibatches :: params.minibatches]
-            tapes = self._tapes if step == 0 else []  # later on they are those of an older policy
+            first, last = edges[step % params.minibatches], edges[step % params.minibatches + 1]
+            recorded = step == 0 and bool(self._tapes)  # later on the tapes are those of an older policy
             self.optimiser.zero_grad()
-            for first in range(0, len(rows), BLOCK):
-                block = rows[first : first + BLOCK]
-                index = slice(block.start, block.stop, block.step)
-                mean, std = self._distribution(batch, index, tapes)
-                log_probability = log_density(batch.command[:, index], mean, std)
+            for start in range(first, last, BLOCK):
+                rows = slice(start, min(start + BLOCK, last))
+                mean, std = self._distribution(batch, rows, recorded)
+                log_probability = log_density(batch.command[:, rows], mean, std)
                 if drawn is None:
-                    gain = surrogate(log_probability, advantage[:, index])
+                    gain = surrogate(log_probability, advantage[:, rows])
                 else:
-                    gain = clipped_surrogate(log_probability, drawn[:, index], advantage[:, index], params.ratio_clip)
+                    gain = clipped_surrogate(log_probability, drawn[:, rows], advantage[:, rows], params.ratio_clip)
                 if params.entropy:
                     gain = gain + params.entropy * entropy(std, self.features.task).sum(0).mean()
-                (-gain * len(block) / len(rows)).backward()
+                (-gain * (rows.stop - rows.start) / (last - first)).backward()
             self._check_gradient()
             if params.trust_region is not None:
                 precondition(self.policy, batch, self.features.task, params.trust_region)
             self.optimiser.step()
             self.gradient_steps += 1
 
-    def _distribution(self, batch: Trajectories, rows: slice, tapes: list[Tape]) -> tuple[Tensor, Tensor]:
+    def _distribution(self, batch: Trajectories, rows: slice, recorded: bool) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the present policy along some episodes."""
-        task = self.features.task
-        every = rows == slice(None) or len(range(self.n_episodes)[rows]) == self.n_episodes
-        chosen = tapes if every else [tape.rows(rows) for tape in tapes]
-        return self.policy.unrolled(batch.y[:, rows], batch.u[:, rows], task, chosen)
+        if not recorded and rows.stop - rows.start < FEW:
+            return self.policy(batch.y[:, rows], batch.u[:, rows], self.features.task)
+        tapes = [tape.part(rows) for tape in self._tapes]
+        return self.policy.unrolled(batch.y[:, rows], batch.u[:, rows], self.features.task, tapes, recorded)
 
     def _check_gradient(self) -> None:
         rate = self.optimiser.param_groups[0]["lr"]

@@ -133,19 +133,24 @@ def provenance(results: Results) -> dict[str, Any]:
     }
 
 
-def write(folder: Path, results: Results) -> Path:
+def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] | None = None) -> Path:
     """Write report.html, figures/, tables/, comparison.csv, seeds.csv and provenance.json; returns the report's path.
 
     What an earlier report left in those places is replaced; other files of the folder stay.
+
+    Args:
+        tabulated: what `tabulate` gave for these results, if it was asked before.
     """
     partial = folder / f".partial.{os.getpid()}"
     shutil.rmtree(partial, ignore_errors=True)
     try:
         for name in ("figures", "tables"):
             (partial / name).mkdir(parents=True)
-        drawn, tabulated, origin = draw(results), tabulate(results), provenance(results)
+        drawn, origin = draw(results), provenance(results)
+        tabulated = tabulate(results) if tabulated is None else tabulated
         for name, figure in drawn.items():
             figure.savefig(partial / "figures" / f"{name}.svg", metadata={"Date": None})
+            figure.set_layout_engine("none")  # it stays as the first file was laid out: a layout costs as much as drawing
             figure.savefig(partial / "figures" / f"{name}.png")
         for name, frame in tabulated.items():
             frame.to_csv(partial / "tables" / f"{name}.csv", index=False, float_format="%.10g")

@@ -1,4 +1,4 @@
-"""Kill, crowd and feed nonsense: `python -m torture.torture --help`; `make torture` runs it and writes reports/reference/reliability.md."""
+"""Kill, crowd and feed nonsense: `python -m torture.torture --help`; `make torture` runs it and writes a report."""
 
 import argparse
 import os
@@ -73,8 +73,8 @@ def written(kills: Tally | None, parallel: Parallel | None, mutated: tuple[int, 
     if parallel is not None:
         text += [
             "## Notebooks side by side",
-            f"{parallel.at_once} at once on {os.cpu_count()} cores, {parallel.rounds} rounds: {parallel.run} run, {len(parallel.lost)}"
-            f" lost, {parallel.seconds:.0f} s.",
+            f"{parallel.at_once} at once on {os.cpu_count()} cores, {parallel.rounds} rounds: {parallel.run} run,"
+            f" {len(parallel.lost)} lost, {parallel.seconds:.0f} s.",
         ]
     if mutated is not None:
         tried, seconds, passed = mutated

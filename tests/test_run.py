@@ -230,7 +230,7 @@ def finished(plan):
 
 
 ONE_SEED = {"demonstrations": 3, "offline": 5, "online": 2, "transfer": 1, "transfer_alone": 1, "report": 1}
-LEARNING = {rule: count for rule, count in ONE_SEED.items() if rule != "demonstrations"}
+ONLINE = {rule: count for rule, count in ONE_SEED.items() if rule not in ("demonstrations", "offline")}
 STAGE = "results/smoke/seed_0/case_{}/{}/record.json"
 
 
@@ -265,7 +265,7 @@ def test_finished_stages_are_skipped(finished):
     ("changed", "old", "new", "jobs"),
     [
         ("params/case_2.yaml", "250", "249", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
-        ("params/learning.yaml", "std_high: {value: 0.25", "std_high: {value: 0.3", LEARNING),
+        ("params/learning.yaml", "std_high: {value: 0.25", "std_high: {value: 0.3", ONLINE),
         ("params/learning.yaml", "episodes: {value: 400", "episodes: {value: 300", {"report": 1}),  # of another scale
         ("params/published.yaml", "21.63", "21.64", {"report": 1}),
         ("notebooks/04_knowledge_transfer.ipynb", "carried = ", "taken = ", {"transfer": 1, "transfer_alone": 1, "report": 1}),

@@ -234,6 +234,7 @@ rule report:
         f"{REPORTS}/notebooks/05_report.ipynb",
     params:
         seeds=len(SEEDS),
+        missing=int(MISSING),
     shell:
-        f"{RUN} 05_report {{log:q}} -p seeds {{params.seeds}} -p missing {int(MISSING)} -p scale {SCALE} -p input_root {FOLDER}"
+        f"{RUN} 05_report {{log:q}} -p seeds {{params.seeds}} -p missing {{params.missing}} -p scale {SCALE} -p input_root {FOLDER}"
         f" -p output_root {shlex.quote(str(Path(REPORTS).resolve()))}"

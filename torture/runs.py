@@ -28,7 +28,7 @@ class Place:
     project: Path
     seeds: int = 1
     targets: tuple[str, ...] = ()
-    options: tuple[str, ...] = ()
+    profile: str = "profiles/local"
 
     @classmethod
     def copied(cls, folder: Path, interval: float = 0.2, **settings: Any) -> "Place":
@@ -54,15 +54,14 @@ class Place:
     def start(self, prefix: Sequence[str] = (), output: Any = subprocess.DEVNULL, **environment: str) -> subprocess.Popen[bytes]:
         """Start or resume the run as `make smoke` does, in a session of its own; `prefix` comes before the command."""
         config = [f"seeds={self.seeds}", "scale=smoke", "reports=results/smoke/report"]
-        command = [sys.executable, "-m", "snakemake", "--profile", "profiles/local", "--cores", "2", *self.options]
+        cores = ["--cores", "2"] if self.profile == "profiles/local" else []
+        command = [sys.executable, "-m", "snakemake", "--profile", self.profile, *cores]
         one_thread = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MPLBACKEND": "agg"}
-        paths = os.pathsep.join(
-            [str(self.project / "src"), *filter(None, [environment.pop("PYTHONPATH", ""), os.environ.get("PYTHONPATH")])]
-        )
+        paths = [str(self.project / "src"), environment.pop("PYTHONPATH", ""), os.environ.get("PYTHONPATH", "")]
         return subprocess.Popen(
             [*prefix, *command, "--config", *config, "--", *self.targets],
             cwd=self.project,
-            env={**os.environ, **one_thread, "PYTHONPATH": paths, **environment},
+            env={**os.environ, **one_thread, "PYTHONPATH": os.pathsep.join(filter(None, paths)), **environment},
             stdout=output,
             stderr=subprocess.STDOUT,
             start_new_session=True,

@@ -13,7 +13,6 @@ import pickle
 import time
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pytest
 import torch
@@ -300,5 +299,5 @@ def test_mutated_tables_of_demonstrations(tmp_path, recorded, change, dtype):
     path = stage.path("demonstrations.csv")
     found = outcome(lambda: trajectories_from_table(stage.table("demonstrations.csv"), *NAMES, dtype, path), f"{path}: ")
     if found is not None:
-        assert all(np.isfinite(signal).all() for signal in vars(found).values())
+        assert all(signal.isfinite().all() for signal in vars(found).values())
         assert {signal.dtype for signal in vars(found).values()} == {dtype}

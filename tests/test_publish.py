@@ -92,6 +92,7 @@ def test_publishing_copies_the_report_and_the_executed_notebooks_of_the_first_se
     old = project / "reports/reference/old.txt"
     old.parent.mkdir()
     old.write_text("of the run before")
+    (old.parent / "reliability.md").write_text("of make torture")
     assert publish.main() == 0
     reference = project / "reports/reference"
     found = {str(path.relative_to(reference)) for path in reference.rglob("*") if path.is_file()}
@@ -99,7 +100,7 @@ def test_publishing_copies_the_report_and_the_executed_notebooks_of_the_first_se
         *("report.html", "figures/figure_3.png", "tables/table_2.csv", "tables/time.csv", "tables/gaps.csv"),
         *("comparison.csv", "seeds.csv", "provenance.json", "notebooks/05_report.ipynb"),
         *("notebooks/02_offline_irl_case_1.ipynb", "notebooks/02_offline_irl_printed_case_1.ipynb"),
-        "notebooks/01_demonstrations_case_3.ipynb",
+        *("notebooks/01_demonstrations_case_3.ipynb", "reliability.md"),
     }
     assert (reference / "notebooks/01_demonstrations_case_3.ipynb").read_text() == "01"
     assert sorted(path.name for path in (project / "reports").iterdir()) == ["latest", "reference"]

@@ -26,8 +26,8 @@ class Tally:
         kills: by kind.
         resumes: runs that were started where others had left results.
         rounds: runs that ended, after any number of kills, and were compared with the undisturbed run.
-        lost: finished results that were gone, or damaged, after a kill.
-        again: finished results that were made once more. One whose stage was ending at the moment of the kill may be.
+        lost: finished results that were damaged, gone or made again after a kill.
+        ending: results whose stage was ending at the moment of a kill: the engine had not noted it, and made them again.
         differing: results that are not those of the undisturbed run, to the last bit.
         left: files that killed processes left among the results of a finished round.
         seconds: of the undisturbed run.
@@ -37,7 +37,7 @@ class Tally:
     resumes: int = 0
     rounds: int = 0
     lost: int = 0
-    again: int = 0
+    ending: int = 0
     differing: int = 0
     left: int = 0
     seconds: float = 0.0
@@ -68,32 +68,33 @@ def survive(place: Place, expected: Content, seconds: float, kills: int, seed: i
     """
     draw, tally = random.Random(seed), Tally(seconds=seconds)
     started: list[psutil.Process] = []
+    kept: dict[str, float] = {}  # the finished results of this round, and the seconds in their records
     place.clear()
     while True:
-        before = place.finished()
-        tally.resumes += bool(before)
+        tally.resumes += bool(place.finished())
         engine = place.start()
         killed = None
-        if sum(tally.kills.values()) < kills:
-            kind = KINDS[sum(tally.kills.values()) % len(KINDS)]
-            killed = strike(engine.pid, kind, draw.uniform(0.0, seconds), started)
+        if (number := sum(tally.kills.values())) < kills:
+            killed = strike(engine.pid, KINDS[number % len(KINDS)], draw.uniform(0.0, seconds), started)
         if killed:
             tally.kills[killed] += 1
         engine.wait(PATIENCE)
-        after = place.finished()
-        tally.lost += len(before.keys() - after.keys())
-        tally.again += sum(before[name] != after[name] for name in before.keys() & after.keys())
+        found, safe = place.finished(), place.safe()
+        gone = {name for name in kept if found.get(name) != kept[name]}
+        tally.lost += len(gone)
+        tally.ending += len(found.keys() - safe.keys())
+        kept = {name: kept[name] for name in kept.keys() - gone} | safe
         if engine.returncode == 0:
             _wait_for_orphans(started)
             tally.rounds += 1
-            found = place.content()
-            tally.differing += sum(found.get(name) != content for name, content in expected.items()) + len(
-                found.keys() - expected.keys()
-            )
+            made = place.content()
+            tally.differing += sum(made.get(name) != content for name, content in expected.items())
+            tally.differing += len(made.keys() - expected.keys())
             tally.left += len(place.left_behind())
             if sum(tally.kills.values()) >= kills:
                 return tally
             place.clear()
+            kept = {}
 
 
 def strike(pid: int, kind: str, delay: float, started: list[psutil.Process]) -> str | None:

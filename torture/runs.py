@@ -1,5 +1,6 @@
 """Smoke runs in a copy of the project: how they are started, what they made, and whether anything was left behind."""
 
+import base64
 import json
 import os
 import re
@@ -94,6 +95,11 @@ class Place:
             except (OSError, ValueError, KeyError):  # being replaced, or damaged
                 continue
         return found
+
+    def safe(self) -> dict[str, float]:
+        """The finished stages that the engine knows to be finished: a resumed run has no reason to make them again."""
+        begun = [base64.b64decode(path.name, b"-_").decode() for path in (self.project / ".snakemake/incomplete").glob("*")]
+        return {name: seconds for name, seconds in self.finished().items() if f"results/smoke/{name}/{RECORD}" not in begun}
 
     def left_behind(self) -> list[str]:
         """Hidden files and folders among the results: of a finished run there should be none."""

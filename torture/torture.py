@@ -22,8 +22,8 @@ from torture.runs import Place
 REPORT = PROJECT / "reports/reference/reliability.md"
 PROPERTIES = PROJECT / "tests/test_properties.py"
 TITLES = {
-    "lost": "finished results gone or damaged after a kill",
-    "again": "finished results made once more",
+    "lost": "finished results damaged, gone or made again after a kill",
+    "ending": "results made again because their stage was just ending",
     "differing": "results that differ from the undisturbed run",
     "left": "files left among the results",
     "seconds": "seconds of the undisturbed run",
@@ -67,8 +67,8 @@ def written(kills: Tally | None, parallel: Parallel | None, mutated: tuple[int, 
             "The smoke run of three case studies, killed by signal 9 at random moments and resumed by the same command. The"
             " interval between checkpoints was 0.2 s, so that kills meet them.",
             to_markdown(pd.DataFrame({"what": rows.keys(), "number": rows.values()})),
-            "A finished result is made once more where its stage was ending at the moment of the kill: the engine had not yet"
-            " noted that it was done. It is the same to the last bit.",
+            "Where a stage was just ending at the moment of the kill, the engine had not noted that it was done, and made it"
+            " again: the same to the last bit.",
         ]
     if parallel is not None:
         text += [

@@ -1,6 +1,8 @@
 # `make help` lists what can be asked for. The plain commands behind each target stand in README.
 PYTHON ?= python3
 SEEDS ?= 1
+MISSING ?= 0
+KILLS ?= 100
 SCALE ?= paper
 CORES ?= 2
 VENV := .venv
@@ -11,7 +13,7 @@ export MKL_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 SNAKEMAKE = $(BIN)/python -m snakemake --profile profiles/local --cores $(CORES)
 
-.PHONY: help setup reports evidence smoke test lab bench publish notebooks clean
+.PHONY: help setup reports evidence smoke test lab bench torture cluster publish notebooks clean
 
 help:  ## show this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-10s %s\n", $$1, $$2}'
@@ -26,12 +28,12 @@ $(VENV)/installed: environment.txt pyproject.toml
 	touch $@
 
 reports: setup  ## run everything at paper scale and write reports/latest/report.html
-	$(SNAKEMAKE) --config seeds=$(SEEDS) scale=paper
+	$(SNAKEMAKE) --config seeds=$(SEEDS) scale=paper missing=$(MISSING)
 	@echo "The report: $(CURDIR)/reports/latest/report.html"
 
 evidence: SEEDS = 20
 evidence: setup  ## twenty seeds of it, the claims, the trials and the inferred settings; resumable
-	$(SNAKEMAKE) --config seeds=$(SEEDS) scale=$(SCALE) evidence=1 $(if $(filter smoke,$(SCALE)),reports=results/smoke/report)
+	$(SNAKEMAKE) --config seeds=$(SEEDS) scale=$(SCALE) missing=$(MISSING) evidence=1 $(if $(filter smoke,$(SCALE)),reports=results/smoke/report)
 
 smoke: setup  ## the same in seconds, with few epochs; the report goes to results/smoke/report/
 	$(SNAKEMAKE) --config seeds=1 scale=smoke reports=results/smoke/report
@@ -50,6 +52,13 @@ lab: setup  ## open JupyterLab on the notebooks
 bench: setup  ## measure speed against the machine's bound and other ways; writes reports/reference/benchmarks
 	$(BIN)/python -m pip install --quiet --constraint environment.txt --editable ".[bench]"
 	$(BIN)/python -m benchmarks.benchmark --whole --cores $(CORES)
+
+torture: setup  ## kill a run KILLS times, crowd notebooks, feed nonsense; writes reports/reference/reliability.md
+	$(BIN)/python -m torture.torture --kills $(KILLS)
+
+cluster: setup  ## as root on Debian: install SLURM, run the smoke scale through it, compare, stop it
+	$(BIN)/python -m pip install --quiet --constraint environment.txt --editable ".[slurm]"
+	$(BIN)/python -m torture.cluster
 
 publish: setup  ## copy reports/latest to reports/reference
 	$(BIN)/python -m helpers.publish

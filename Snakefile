@@ -81,7 +81,7 @@ onstart:
 
 onerror:
     found = failures()
-    print(f"\n{len(found)} stage(s) failed; the others are finished and are not run again:", file=sys.stderr)
+    print(f"\n{len(found) or 'no'} notebook(s) failed; what is finished is kept and not run again.", file=sys.stderr)
     for sentence in found.values():
         print(f"  {sentence}", file=sys.stderr)
     if found:
@@ -143,7 +143,7 @@ rule online:
 
 rule transfer:
     input:
-        made_from("04_knowledge_transfer", f"{RESULTS}/{SCALE}/seed_{{seed}}/case_3/online_{{variant}}/record.json"),
+        made_from("04_knowledge_transfer", f"{RESULTS}/{SCALE}/seed_{{seed}}/case_3/transfer_{{variant}}/record.json"),
         demonstrations=f"{RESULTS}/{SCALE}/seed_{{seed}}/case_3/demonstrations/record.json",
         source=f"{RESULTS}/{SCALE}/seed_{{seed}}/case_1/offline_{{variant}}/record.json",
     output:
@@ -234,6 +234,7 @@ rule report:
         f"{REPORTS}/notebooks/05_report.ipynb",
     params:
         seeds=len(SEEDS),
+        missing=int(MISSING),
     shell:
-        f"{RUN} 05_report {{log:q}} -p seeds {{params.seeds}} -p missing {int(MISSING)} -p scale {SCALE} -p input_root {FOLDER}"
+        f"{RUN} 05_report {{log:q}} -p seeds {{params.seeds}} -p missing {{params.missing}} -p scale {SCALE} -p input_root {FOLDER}"
         f" -p output_root {shlex.quote(str(Path(REPORTS).resolve()))}"

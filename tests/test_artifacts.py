@@ -1,6 +1,7 @@
 """Results on disk: written whole or not at all, read back to the last bit, and refused in one sentence when damaged."""
 
 import json
+import os
 import pickle
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from helpers import artifacts
 from helpers.artifacts import ArtifactError, load_stage, save_stage, trajectories_from_table, trajectories_to_table
 from helpers.randomness import stream
 from helpers.rollout import rollout
+from helpers.scratch import beside
 
 AWKWARD = pd.DataFrame({"number": [0.1, 1 / 3, 1e-300, np.pi * 1e17, -0.0, np.nan], "name": list("abcdef")})
 
@@ -80,6 +82,70 @@ def test_a_failure_in_the_middle_of_a_first_run_leaves_nothing(folder):
 
 def test_new_results_take_the_place_of_all_older_ones(saved):
     assert [path.name for path in save_stage(saved.folder, {}, {"other.csv": AWKWARD}).folder.glob("*.csv")] == ["other.csv"]
+
+
+@pytest.mark.parametrize("name", ["../table.csv", "/tmp/table.csv", "deep/table.csv", ".."])
+def test_a_file_name_cannot_lead_out_of_the_folder(folder, name):
+    assert "leads out" in refusal(save_stage, folder, {}, {name: AWKWARD})
+    assert not folder.parent.exists()
+
+
+def test_what_dead_processes_left_is_swept_and_what_living_ones_write_is_not(saved):
+    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True, check=True)
+    left = [beside(saved.folder).name.replace(str(os.getpid()), number) for number in (dead.stdout.strip(), str(os.getppid()))]
+    for name in left:
+        (saved.folder.parent / name).mkdir()
+    save_stage(saved.folder, {}, {"a.csv": AWKWARD})
+    assert {path.name for path in saved.folder.parent.iterdir()} == {"stage", left[1]}
+
+
+def test_whoever_reads_while_the_same_results_are_written_again_finds_them(saved):
+    """As a killed run's notebook does that lives on beside the resumed one: whole results at every moment."""
+    code = """if True:
+        import sys
+        from helpers.artifacts import Path, pd, save_stage
+        table = pd.read_csv(sys.argv[2])
+        for number in range(150):
+            save_stage(Path(sys.argv[1]), {"seed": number}, {"table.csv": table}, texts={"note.txt": "µ"})
+    """
+    writers = [subprocess.Popen([sys.executable, "-c", code, saved.folder, saved.path("table.csv")]) for _ in range(2)]
+    reads = 0
+    while any(writer.poll() is None for writer in writers):
+        assert load_stage(saved.folder, "this").content == saved.content
+        reads += 1
+    assert [writer.wait() for writer in writers] == [0, 0]
+    assert reads > 100
+
+
+def test_a_kill_between_two_files_is_never_taken_for_a_result(saved, monkeypatch):
+    """After any number of the renames, the folder holds the older results, the new ones, or is refused."""
+    new = {"table.csv": AWKWARD.assign(number=1.0), "other.csv": AWKWARD}
+    rename, left = Path.replace, 0
+
+    def dying(path, target):
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise FaultError
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "replace", dying)
+    for number in range(3):
+        save_before = load_or_none(saved.folder)
+        assert save_before is None or save_before == saved.content
+        left = number
+        with pytest.raises(FaultError):
+            save_stage(saved.folder, {}, new)
+    left = 9
+    assert save_stage(saved.folder, {}, new).content != saved.content
+
+
+def load_or_none(folder):
+    """The content of a stage, or None if it is refused."""
+    try:
+        return load_stage(folder, "this").content
+    except ArtifactError:
+        return None
 
 
 @pytest.mark.parametrize("below", ["", "seed_0/stage"])
@@ -242,9 +308,3 @@ def test_code_revision_tells_a_commit_from_changed_files_and_from_no_checkout(tm
     assert clean.isalnum()
     (tmp_path / "new.py").touch()
     assert artifacts.code_revision(tmp_path) == clean + "+changes"
-
-
-def test_versions_name_python_and_torch():
-    found = artifacts.versions()
-    assert found["python"] == ".".join(map(str, sys.version_info[:3]))
-    assert found["torch"] == torch.__version__

@@ -8,7 +8,7 @@ from helpers import publish
 from helpers.publish import PublishError, check
 
 REVISION = "0123abcd" * 5
-GOOD = {"scale": "paper", "revision": REVISION, "revisions_of_stages": [REVISION], "seeds": [0, 1], "notebooks_changed_since": []}
+GOOD = {"scale": "paper", "revision": REVISION, "revisions_of_stages": [REVISION], "seeds": [0, 1], "missing_seeds": []}
 OTHER = "f" * 40
 
 
@@ -30,7 +30,7 @@ REFUSED = {
     ),
     "one stage of changed code": ({"revisions_of_stages": [REVISION, REVISION + "+changes"]}, None, REVISION, "+changes"),
     "a report of another commit": ({"revision": OTHER}, None, REVISION, OTHER),
-    "stages of other code": ({"notebooks_changed_since": ["02_offline_irl"]}, None, REVISION, "02_offline_irl"),
+    "seeds that failed": ({"missing_seeds": [3, 7]}, None, REVISION, "lacks the seeds 3, 7"),
     "another commit now": ({}, None, OTHER, OTHER),
     "no checkout": ({"revision": "unknown", "revisions_of_stages": ["unknown"]}, None, "unknown", "unknown"),
 }
@@ -92,6 +92,7 @@ def test_publishing_copies_the_report_and_the_executed_notebooks_of_the_first_se
     old = project / "reports/reference/old.txt"
     old.parent.mkdir()
     old.write_text("of the run before")
+    (old.parent / "reliability.md").write_text("of make torture")
     assert publish.main() == 0
     reference = project / "reports/reference"
     found = {str(path.relative_to(reference)) for path in reference.rglob("*") if path.is_file()}
@@ -99,7 +100,7 @@ def test_publishing_copies_the_report_and_the_executed_notebooks_of_the_first_se
         *("report.html", "figures/figure_3.png", "tables/table_2.csv", "tables/time.csv", "tables/gaps.csv"),
         *("comparison.csv", "seeds.csv", "provenance.json", "notebooks/05_report.ipynb"),
         *("notebooks/02_offline_irl_case_1.ipynb", "notebooks/02_offline_irl_printed_case_1.ipynb"),
-        "notebooks/01_demonstrations_case_3.ipynb",
+        *("notebooks/01_demonstrations_case_3.ipynb", "reliability.md"),
     }
     assert (reference / "notebooks/01_demonstrations_case_3.ipynb").read_text() == "01"
     assert sorted(path.name for path in (project / "reports").iterdir()) == ["latest", "reference"]

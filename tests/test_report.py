@@ -9,7 +9,7 @@ from itertools import product
 import pandas as pd
 import pytest
 
-from helpers import collection, report, scorecard
+from helpers import collection, freshness, identity, report, scorecard
 from helpers.artifacts import ArtifactError, save_stage
 from helpers.sources import PROJECT
 
@@ -225,8 +225,28 @@ def test_seeds_hold_the_metrics_of_every_stage(written):
 
 
 @pytest.fixture
-def inputs(tmp_path):
+def inputs(tmp_path, monkeypatch):
+    """A copy of the committed results, for which the same holds: another commit made them, on another machine."""
+    monkeypatch.setattr(freshness, "COMMITTED", tmp_path / "inputs")
     return shutil.copytree(INPUTS, tmp_path / "inputs")
+
+
+def origin(notebook, case, seed, variant="improved", upstream=None):
+    """The part of a record that says where a result comes from, as if it had been made now."""
+    run = {"notebook": notebook, "case": case, "seed": seed, "scale": "smoke", "variant": variant}
+    made_from, upstream = identity.inputs(notebook, PARAMS, "smoke", case, variant), upstream or {}
+    return run | {"inputs": made_from, "upstream": upstream, "identity": identity.identity(run, made_from, upstream)}
+
+
+@pytest.fixture
+def own(tmp_path):
+    """The same results, as if the present code had made them on this machine."""
+    folder = shutil.copytree(INPUTS, tmp_path / "own")
+    for path in folder.rglob("record.json"):
+        record = json.loads(path.read_text())
+        now = origin(*(record[name] for name in ("notebook", "case", "seed", "variant", "upstream")))
+        path.write_text(json.dumps(record | now))
+    return folder
 
 
 def refusal(*arguments):
@@ -285,11 +305,13 @@ def test_claims_trials_and_budget_appear_where_they_were_run(several):
     assert not {"claims", "trials"} & report.tabulate(before).keys()
     for seed, case in product(range(6), CASES):
         folder = several / f"smoke/seed_{seed}/case_{case}"
-        save_stage(folder / "experiments", {}, {"scores.csv": pd.DataFrame({"stage": ["x"], "metric": ["y"], "value": [1.0]})})
+        made = origin("08_claims", case, seed)
+        save_stage(folder / "experiments", made, {"scores.csv": pd.DataFrame({"stage": ["x"], "metric": ["y"], "value": [1.0]})})
         budget = pd.DataFrame({"episodes_per_epoch": [20, 500], "objective": [9.0 + seed, 12.0 + seed]})
-        save_stage(folder / "online_budget", {}, {"scores.csv": budget})
+        save_stage(folder / "online_budget", made, {"scores.csv": budget})
         scores = pd.DataFrame({"stage": ["offline"], "metric": ["feature_gap"], "value": [0.1 + seed / 100]})
-        save_stage(folder / f"{'transfer' if case == 3 else 'offline'}_{trial}", {}, {"scores.csv": scores})
+        made = origin("04_knowledge_transfer" if case == 3 else "02_offline_irl", case, seed, trial)
+        save_stage(folder / f"{'transfer' if case == 3 else 'offline'}_{trial}", made, {"scores.csv": scores})
     results = collect(several, PARAMS, 6)
     drawn = report.draw(results)
     assert "online_budget" in drawn
@@ -313,15 +335,59 @@ def test_a_stage_made_with_other_parameters_is_refused_by_name(inputs, tmp_path)
     case = params / "case_2.yaml"
     case.write_text(case.read_text().replace("value: 250", "value: 249"))
     sentence = refusal(inputs, params)
-    assert "case_2/demonstrations/record.json: made with other parameters" in sentence
-    assert str(params) in sentence
+    assert "case_2/demonstrations/record.json" in sentence
+    assert "(changed: params/case_2.yaml)" in sentence
+    assert "case_1/demonstrations" not in sentence
 
 
-def test_a_record_without_its_parameters_is_refused(inputs):
+def test_a_record_without_its_origin_is_refused(inputs):
     path = inputs / "smoke/seed_0/case_1/demonstrations/record.json"
     record = json.loads(path.read_text())
-    path.write_text(json.dumps({"files": record["files"]}))
-    assert str(path) in refusal(inputs)
+    for left in ({}, {"notebook": "01_demonstrations", "case": 1}):
+        path.write_text(json.dumps({"files": record["files"]} | left))
+        assert str(path) in refusal(inputs)
+
+
+MIXTURES = {
+    "a module": (("inputs", "src/helpers/lstm.py"), "src/helpers/lstm.py"),
+    "a package": (("inputs", "torch"), "torch"),
+    "a notebook": (("inputs", "notebooks/02_offline_irl.ipynb"), "notebooks/02_offline_irl.ipynb"),
+    "a parameter file": (("inputs", "params/learning.yaml"), "params/learning.yaml"),
+    "an earlier result": (("upstream", "case_2/demonstrations"), "seed_0/case_2/demonstrations"),
+    "another seed": (("seed",), "the record itself"),
+}
+
+
+@pytest.mark.parametrize(("entry", "says"), MIXTURES.values(), ids=MIXTURES)
+def test_a_mixture_is_refused_naming_the_result_and_what_changed(own, entry, says):
+    path = own / "smoke/seed_0/case_2/offline_improved/record.json"
+    whole = json.loads(path.read_text())
+    part = whole
+    for name in entry[:-1]:
+        part = part[name]
+    assert entry[-1] in part
+    part[entry[-1]] = 7
+    assert collect(own).n_seeds == 1
+    path.write_text(json.dumps(whole))
+    sentence = refusal(own)
+    assert f"{path} (changed: {says})" in sentence
+    assert sentence.count("record.json") == 1
+
+
+def test_seeds_with_missing_stages_are_left_out_only_when_asked_and_the_report_says_so(several, tmp_path):
+    shutil.rmtree(several / "smoke/seed_2/case_3/transfer_improved")
+    with pytest.raises(ArtifactError, match="seed_2/case_3/transfer_improved"):
+        collect(several, PARAMS, 6)
+    results = collection.collect(several, PARAMS, "smoke", CASES, 6, missing_allowed=True)
+    assert (results.missing, results.n_seeds, set(results.seeds["seed"])) == ((2,), 5, {0, 1, 3, 4, 5})
+    origin = report.provenance(results)
+    assert origin["missing_seeds"] == [2]
+    text = report.render(results, report.tabulate(results), origin)
+    assert "shows 5 of 6 seeds: a stage of seed 2 failed or was not run" in text
+    for seed in (0, 1, 3, 4, 5):
+        shutil.rmtree(several / f"smoke/seed_{seed}/case_1/demonstrations")
+    with pytest.raises(ArtifactError, match="seed_0/case_1/demonstrations"):  # none is whole
+        collection.collect(several, PARAMS, "smoke", CASES, 6, missing_allowed=True)
 
 
 @pytest.mark.parametrize("broken", ["draw", "tabulate", "render", "typeset"])

@@ -1,5 +1,6 @@
 """One stage = one notebook: the command line, plain papermill, and the order of the stages in the Snakefile."""
 
+import json
 import os
 import re
 import shutil
@@ -10,7 +11,7 @@ from pathlib import Path
 import nbformat
 import pytest
 
-from helpers import run
+from helpers import identity, run
 from helpers.artifacts import load_stage
 from helpers.sources import PROJECT
 
@@ -85,6 +86,8 @@ WRONG_ARGUMENTS = {
     "a strange digit": (["01_demonstrations", "-p", "seed", "²"], "'seed'"),
     "an unknown scale": (["02_offline_irl", "-p", "scale", "huge"], "'huge'"),
     "an unknown notebook": (["06_oracle"], "06_oracle.ipynb"),
+    "a notebook elsewhere": (["../notebooks/01_demonstrations"], "there is no such notebook"),
+    "results among the code": (["01_demonstrations", "-p", "output_root", str(PROJECT / "results/../src")], "'output_root'"),
 }
 
 
@@ -92,12 +95,24 @@ WRONG_ARGUMENTS = {
 def test_wrong_arguments_end_at_once_with_nothing_run_and_nothing_written(monkeypatch, here, capfd, arguments, says):
     monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, **__: pytest.fail("the notebook was run"))
     notebook, *parameters = arguments
-    assert run.main([notebook, "copies/x.ipynb", *parameters, "-p", "output_root", str(here / "out")]) == 2
+    assert run.main([notebook, "copies/x.ipynb", "-p", "output_root", str(here / "out"), *parameters]) == 2
     said = capfd.readouterr().err
     assert said.startswith("error: ")
     assert said.count("\n") == 1
     assert says in said
     assert everything_below(here) == []
+
+
+@pytest.mark.parametrize(
+    "output", ["src/helpers/run.ipynb", "notebooks/01_demonstrations.ipynb", "results/../README.md", "x.ipynb"]
+)
+def test_no_executed_copy_is_written_over_what_the_project_is_made_of(monkeypatch, here, capfd, output):
+    monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, **__: pytest.fail("the notebook was run"))
+    (here / "link").symlink_to(PROJECT)
+    for place in (PROJECT / output, here / "link" / output):
+        assert run.main(["01_demonstrations", str(place), "-p", "output_root", str(here / "out")]) == 2
+        assert "'output'" in capfd.readouterr().err
+    assert everything_below(here) == ["link"]
 
 
 def test_roots_are_those_of_the_callers_directory(monkeypatch, here):
@@ -126,7 +141,8 @@ def test_a_missing_result_ends_in_a_sentence_and_keeps_the_executed_copy(here, c
     missing = here / "nothing/smoke/seed_0/case_1/demonstrations/record.json"
     sentence = f"ArtifactError: {missing}: this result is missing; run 01_demonstrations for case 1 first"
     assert said.splitlines()[-1] == f"error: 02_offline_irl: {sentence} (executed copy with the traceback: copies/02.ipynb)"
-    assert everything_below(here) == ["copies", "copies/02.ipynb"]
+    assert everything_below(here) == ["copies", "copies/02.failed", "copies/02.ipynb"]
+    assert f"error: {(here / 'copies/02.failed').read_text().strip()}" == said.splitlines()[-1]
     outputs = [output for cell in nbformat.read("copies/02.ipynb", 4).cells for output in cell.get("outputs", [])]
     (error,) = [output for output in outputs if output.output_type == "error"]
     assert "\n".join(error.traceback) == sentence
@@ -140,6 +156,9 @@ def test_a_notebook_that_raises_keeps_its_traceback_in_place_of_an_older_copy(he
     (error,) = [output for cell in nbformat.read("02.ipynb", 4).cells for output in cell.get("outputs", [])]
     traceback = re.sub(r"\x1b\[[\d;]*m", "", "\n".join(error.traceback))
     assert "----> 2 bad = good / 0" in traceback
+    assert everything_below(here) == ["02.failed", "02.ipynb", "notebooks", "notebooks/02_offline_irl.ipynb"]
+    toy("good = 1")
+    assert run.main(["02_offline_irl", "02.ipynb"]) == 0
     assert everything_below(here) == ["02.ipynb", "notebooks", "notebooks/02_offline_irl.ipynb"]
 
 
@@ -188,15 +207,22 @@ def plan(tmp_path):
 
 @pytest.fixture
 def finished(plan):
-    """The same after a finished run."""
-    shutil.copytree(PROJECT / "notebooks/inputs", plan.folder / "results")
-    (plan.folder / "report").mkdir()
-    # As stages finish one after the other: code and parameters, then their results, then the report.
+    """The same after a finished run, whose results were made from what the copy holds."""
+    copy = plan.folder
+    shutil.copytree(PROJECT / "notebooks/inputs", copy / "results")
+    (copy / "report").mkdir()
+    for path in (copy / "results").rglob("record.json"):
+        record = json.loads(path.read_text(encoding="utf-8"))
+        run = [record[name] for name in ("notebook", "scale", "case", "variant")]
+        record["inputs"] = identity.inputs(run[0], copy / "params", *run[1:], copy)
+        path.write_text(json.dumps(record), encoding="utf-8")
+    made_from = identity.inputs("05_report", copy / "params", "smoke", project=copy)
+    (copy / "report/provenance.json").write_text(json.dumps({"inputs": made_from}), encoding="utf-8")
+    (copy / "report/report.html").touch()
+    # As stages finish one after the other, then the report.
     order = {"record.json": 2000, "report.html": 3000, "provenance.json": 3000}
-    for name in ("report.html", "provenance.json"):
-        (plan.folder / "report" / name).touch()
     stages = ["demonstrations", "offline", "transfer", "online"]
-    for path in plan.folder.rglob("*"):
+    for path in copy.rglob("*"):
         after = next((number for number, stage in enumerate(stages) if path.parent.name.startswith(stage)), 0)
         time = order.get(path.name, 1000) + after
         os.utime(path, (time, time))
@@ -204,6 +230,7 @@ def finished(plan):
 
 
 ONE_SEED = {"demonstrations": 3, "offline": 5, "online": 2, "transfer": 1, "transfer_alone": 1, "report": 1}
+ONLINE = {rule: count for rule, count in ONE_SEED.items() if rule not in ("demonstrations", "offline")}
 STAGE = "results/smoke/seed_0/case_{}/{}/record.json"
 
 
@@ -235,18 +262,42 @@ def test_finished_stages_are_skipped(finished):
 
 
 @pytest.mark.parametrize(
-    ("changed", "jobs"),
+    ("changed", "old", "new", "jobs"),
     [
-        ("params/case_2.yaml", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
-        ("params/published.yaml", {"report": 1}),
-        ("notebooks/04_knowledge_transfer.ipynb", {"transfer": 1, "transfer_alone": 1, "report": 1}),
-        ("src/helpers/maxent_irl.py", ONE_SEED),
-        ("src/helpers/report.py", {"report": 1}),
-        ("reports/template/report.md.jinja", {"report": 1}),
-        # Stages draw with it, and store what they draw (response.csv).
-        ("src/helpers/figures.py", ONE_SEED),
+        ("params/case_2.yaml", "250", "249", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
+        ("params/learning.yaml", "std_high: {value: 0.25", "std_high: {value: 0.3", ONLINE),
+        ("params/learning.yaml", "episodes: {value: 400", "episodes: {value: 300", {"report": 1}),  # of another scale
+        ("params/published.yaml", "21.63", "21.64", {"report": 1}),
+        ("notebooks/04_knowledge_transfer.ipynb", "carried = ", "taken = ", {"transfer": 1, "transfer_alone": 1, "report": 1}),
+        ("src/helpers/maxent_irl.py", "projected", "", {}),
+        ("src/helpers/maxent_irl.py", "return project(self.mean)", "return project(self.mean.clone())", ONE_SEED),
+        ("src/helpers/report.py", "RUNNERS = (", "RUNNERS = (*(),", {"report": 1}),
+        ("reports/template/report.md.jinja", "# In one page", "# In a page", {"report": 1}),
+        ("src/helpers/figures.py", "MUTED = ", "MUTED: str = ", ONE_SEED),  # stages store what they draw (response.csv)
     ],
 )
-def test_a_change_makes_what_depends_on_it_run_again(finished, changed, jobs):
-    (finished.folder / changed).touch()
+def test_a_change_makes_exactly_what_depends_on_it_run_again(finished, changed, old, new, jobs):
+    path = finished.folder / changed
+    before = path.read_text(encoding="utf-8")
+    path.touch()
+    if jobs:
+        assert old in before
+        path.write_text(before.replace(old, new, 1), encoding="utf-8")
+    else:
+        path.write_text(f"{before}# a comment\n", encoding="utf-8")
     assert finished() == jobs
+    path.write_text(before, encoding="utf-8")
+    if not changed.startswith("reports"):
+        assert finished() == {}  # whatever the times of the files
+
+
+def test_a_damaged_record_is_made_again(finished):
+    (finished.folder / STAGE.format(2, "online_improved")).write_text("{")
+    assert finished() == {"online": 1, "report": 1}
+
+
+def test_a_report_of_the_seeds_that_are_whole_is_made_only_when_asked(finished):
+    (finished.folder / STAGE.format(2, "online_improved")).unlink()
+    (finished.folder / "report/report.html").unlink()
+    assert finished(missing=1) == {"report": 1}
+    assert finished() == {"online": 1, "report": 1}

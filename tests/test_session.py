@@ -161,7 +161,7 @@ def test_a_saved_stage_records_where_it_comes_from(tmp_path):
     session = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, seed=4, output_root=str(tmp_path)))
     record = session.save("offline_improved", {"t.csv": pd.DataFrame({"a": [1]})}).record
     assert {"notebook": OFFLINE, "case": 1, "seed": 4, "scale": "smoke", "variant": "improved"}.items() <= record.items()
-    assert record["parameters"] == parameters_hash(session.params)
-    assert {"revision", "versions", "seconds"} <= record.keys()
+    assert record["inputs"] == session.inputs_now()
+    assert {"identity", "upstream", "revision", "versions", "seconds"} <= record.keys()
     loaded = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, seed=4, input_root=str(tmp_path))).load("offline_improved", "02")
     assert loaded.record == record

@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -35,27 +34,33 @@ def test_a_stage_does_not_depend_on_what_only_the_report_needs():
 
 
 def test_imports_inside_functions_and_of_the_package_count():
-    code = "import helpers.lstm\ndef verb():\n    from helpers import policy, nothing\n    from helpers.task import ControlTask\n"
-    assert sorted(Path(path).stem for path in sources._imported(code)) == ["lstm", "policy", "task"]
+    code = "import helpers.lstm\ndef verb():\n    from helpers import policy\n    from helpers.task import ControlTask\n"
+    assert sorted(sources._imported(code)) == ["lstm", "policy", "task"]
 
 
-def test_the_fingerprint_follows_the_code_and_not_the_comments(tmp_path, monkeypatch):
-    package, notebooks = tmp_path / "src/helpers", tmp_path / "notebooks"
-    package.mkdir(parents=True)
-    notebooks.mkdir()
-    cell = {"cell_type": "code", "source": ["from helpers import verb\n"], "outputs": [], "metadata": {}}
-    (notebooks / "01.ipynb").write_text(json.dumps({"cells": [cell]}), encoding="utf-8")
-    monkeypatch.setattr(sources, "PACKAGE", package)
-    monkeypatch.setattr(sources, "PROJECT", tmp_path)
+@pytest.fixture
+def project(tmp_path):
+    """A project of one notebook, a module behind it and one that is not."""
+    for folder in ("src/helpers", "notebooks"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "src/helpers/idle.py").write_text("y = 1\n")
 
-    def fingerprint(verb, idle="y = 1\n"):
-        (package / "verb.py").write_text(verb, encoding="utf-8")
-        (package / "idle.py").write_text(idle, encoding="utf-8")
-        sources._imported.cache_clear()
-        return sources.fingerprint("01")
+    def write(verb="x = 1\n", cell="from helpers import verb, nothing\n", seed="seed = 0"):
+        cells = [
+            {"cell_type": "code", "source": [source], "outputs": [], "metadata": {"tags": tags}}
+            for source, tags in ((seed, ["parameters"]), (cell, []))
+        ]
+        (tmp_path / "notebooks/01.ipynb").write_text(json.dumps({"cells": cells}), encoding="utf-8")
+        (tmp_path / "src/helpers/verb.py").write_text(verb, encoding="utf-8")
+        return sources.code_behind("01", tmp_path)
 
-    first = fingerprint("x = 1\n")
-    assert fingerprint("x = 1  # one\n\n") == first
-    assert fingerprint("x = 1\n", "y = 2\n") == first  # no module behind the notebook
-    assert fingerprint("x = 2\n") != first
-    sources._imported.cache_clear()
+    return write
+
+
+def test_the_code_behind_a_notebook_is_named_and_hashed_without_comments_and_parameters(project):
+    first = project()
+    assert sorted(first) == ["notebooks/01.ipynb", "src/helpers/verb.py"]
+    assert project("x = 1  # one\n\n", seed="seed = 1") == first
+    assert project("x = 2\n") == first | {"src/helpers/verb.py": project("x = 2\n")["src/helpers/verb.py"]} != first
+    assert project(cell="from helpers import verb\nverb.x\n")["src/helpers/verb.py"] == first["src/helpers/verb.py"]
+    assert project(cell="from helpers import verb\nverb.x\n") != first

@@ -54,7 +54,7 @@ class Stage:
         path = self.path(name)
         try:
             frame = pd.read_csv(path)
-        except ValueError as error:  # pandas' own errors are kinds of it
+        except (OSError, OverflowError, ValueError) as error:  # pandas' own errors are kinds of the last
             raise ArtifactError(f"{path}: not a table: {' '.join(str(error).split())}; run the stage again") from error
         for column in columns:
             if column not in frame:
@@ -68,7 +68,7 @@ class Stage:
         expected = policy.state_dict()
         try:
             found = load_tensors(path.read_bytes())
-        except SafetensorError as error:
+        except (OSError, KeyError, SafetensorError) as error:  # KeyError: a number type that torch does not have
             raise ArtifactError(f"{path}: not a policy file: {error}") from error
         for name in sorted({*expected, *found}):
             shapes = [tuple(tensors[name].shape) if name in tensors else None for tensors in (found, expected)]
@@ -76,6 +76,8 @@ class Stage:
                 raise ArtifactError(
                     f"{path}: key '{name}': a policy of another shape, params/learning.yaml asks for {shapes[1]}, found {shapes[0]}"
                 )
+            if not found[name].isfinite().all():
+                raise ArtifactError(f"{path}: key '{name}': expected finite numbers; run the stage again")
         policy.load_state_dict({name: tensor.to(task.set_point.dtype) for name, tensor in found.items()})
         return policy
 
@@ -143,14 +145,21 @@ def load_stage(folder: Path, made_by: str) -> Stage:
         raise ArtifactError(f"{path}: this result is missing; run {made_by} first")
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-        files = dict(record["files"])
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError, UnicodeDecodeError) as error:
+        files = record["files"]
+        whole = all(isinstance(expected, str) and Path(name).name == name for name, expected in files.items())
+    except (AttributeError, KeyError, OSError, RecursionError, TypeError, ValueError) as error:
         raise ArtifactError(f"{path}: this result is damaged; run {made_by} again") from error
+    if not whole:
+        raise ArtifactError(f"{path}: key 'files': expected file names and their hashes; run {made_by} again")
     for name, expected in files.items():
         file = folder / name
         if not file.is_file():
             raise ArtifactError(f"{file}: this file is missing; run {made_by} again")
-        if _hash(file) != expected:
+        try:
+            found = _hash(file)
+        except OSError as error:
+            raise ArtifactError(f"{file}: this file cannot be read: {error.strerror}") from error
+        if found != expected:
             raise ArtifactError(f"{file}: this file has changed since it was written; run {made_by} again")
     return Stage(folder, record)
 
@@ -195,9 +204,11 @@ def trajectories_from_table(
         ArtifactError: if a column is missing, the trajectories differ in length, or a number is not finite.
     """
     groups = {"x": controlled, "y": controlled, "u": manipulated, "command": manipulated}
-    for column in ("trajectory", "sample", *(f"{prefix}_{name}" for prefix, names in groups.items() for name in names)):
+    columns = ["trajectory", "sample", *(f"{prefix}_{name}" for prefix, names in groups.items() for name in names)]
+    for column in columns:
         if column not in table:
             raise ArtifactError(f"{path}: the column '{column}' is missing")
+    table = table[columns].apply(pd.to_numeric, errors="coerce")  # a word becomes nan
     ordered = table.sort_values(["trajectory", "sample"])
     n_trajectories = ordered["trajectory"].nunique()
     n_samples = len(ordered) // max(1, n_trajectories)
@@ -207,12 +218,11 @@ def trajectories_from_table(
     signals = {}
     for prefix, names in groups.items():
         columns = [f"{prefix}_{name}" for name in names]
-        numbers = ordered[columns].apply(pd.to_numeric, errors="coerce")  # a word becomes nan
-        values = torch.tensor(numbers.to_numpy(dtype=float)).reshape(n_trajectories, n_samples, len(names))
-        values = values.transpose(0, 1)[: n_samples - (prefix in ("u", "command"))]
+        values = torch.tensor(ordered[columns].to_numpy(dtype=float)).reshape(n_trajectories, n_samples, len(names))
+        values = values.transpose(0, 1)[: n_samples - (prefix in ("u", "command"))].to(dtype)
         if not torch.isfinite(values).all():
             raise ArtifactError(f"{path}: columns {', '.join(columns)}: expected finite numbers")
-        signals[prefix] = values.to(dtype).contiguous()
+        signals[prefix] = values.contiguous()
     return Trajectories(**signals)
 
 

@@ -17,7 +17,11 @@ from helpers.params import LEAF_KEYS, read_yaml
 from helpers.sources import PROJECT, code_behind
 
 PACKAGES = ("torch", "numpy", "scipy", "pandas", "cma", "safetensors", "sympy", "pydantic", "ruamel.yaml", "matplotlib", "seaborn")
-RECORDING = "01_demonstrations"  # nothing is learned there
+UNREAD = {  # sections of learning.yaml
+    "01_demonstrations": ("policy", "variants", "online"),
+    "02_offline_irl": ("online",),
+    "03_online_improvement": ("variants",),
+}
 OF_ALL_CASES = ("00_inferred_settings", "05_report")
 MORE_FILES = {
     "00_inferred_settings": ("identification", "published"),
@@ -35,7 +39,7 @@ def versions() -> dict[str, str]:
 
 def digest(content: Any) -> str:
     """A hash of plain content; the order of keys does not count."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def inputs(
@@ -84,7 +88,7 @@ def _files(notebook: str, params_root: Path, case: int | None, variant: str) -> 
 
 
 def _is_trial(params_root: Path, variant: str) -> bool:
-    return variant not in read_yaml(params_root / "learning.yaml").get("variants", {})
+    return not any(key.startswith(f"variants.{variant}.") for key, _ in _values(read_yaml(params_root / "learning.yaml")))
 
 
 def _read_by(
@@ -95,10 +99,9 @@ def _read_by(
     if name == "learning":
         base = variant
         if _is_trial(params_root, variant):
-            base = str(read_yaml(params_root / "trials.yaml").get(variant, {}).get("base"))
+            base = str(dict(_values(read_yaml(params_root / "trials.yaml"))).get(f"{variant}.base"))
         only = {"scales": scale, "variants": base}
-        if notebook == RECORDING:
-            values = {key: value for key, value in values.items() if key.startswith("scales.")}
+        values = {key: value for key, value in values.items() if key.split(".")[0] not in UNREAD.get(notebook, ())}
     elif name == "demonstrators":
         own = dict(_values(read_yaml(params_root / f"case_{case}.yaml"))).get("demonstrator")
         values = {key: value for key, value in values.items() if key.split(".")[0] == own}

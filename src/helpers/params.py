@@ -16,15 +16,21 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, Strict, ValidationError, model_validator
 from pydantic_core import PydanticCustomError, core_schema
 from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer, ComposerError
 from ruamel.yaml.constructor import DuplicateKeyError
 from ruamel.yaml.error import YAMLError
+from ruamel.yaml.events import AliasEvent
 
 LEAF_KEYS = ("value", "unit", "source", "status")
 STATUSES = ("reported", "inferred", "assumed")
+LONGEST = 200  # characters of a file that a message shows
 
 
 class InputError(ValueError):
-    """What a user gave cannot be used; the message is one sentence that says all there is to say."""
+    """What a user gave cannot be used; the message is one sentence, on one line, that says all there is to say."""
+
+    def __init__(self, sentence: str) -> None:
+        super().__init__(" ".join(sentence.splitlines()))  # it may quote what it met
 
     def _render_traceback_(self) -> list[str]:
         """What IPython shows: the sentence alone."""
@@ -689,8 +695,10 @@ def read_yaml(path: Path) -> dict[str, Any]:
         content = copy.deepcopy(_parsed(path.read_text(encoding="utf-8")))
     except DuplicateKeyError as error:
         raise ParameterError(f"{path}: {' '.join(str(error.problem).split())}") from error
-    except (YAMLError, UnicodeDecodeError, ValueError) as error:
-        raise ParameterError(f"{path}: not readable as YAML: {' '.join(str(error).split())[:200]}") from error
+    except RecursionError as error:
+        raise ParameterError(f"{path}: not readable as YAML: its entries are nested too deeply") from error
+    except (OSError, YAMLError, UnicodeDecodeError, ValueError) as error:
+        raise ParameterError(f"{path}: not readable as YAML: {' '.join(str(error).split())[:LONGEST]}") from error
     if not isinstance(content, dict):
         raise ParameterError(f"{path}: expected keys and values, found {type(content).__name__}")
     for key in content:
@@ -699,9 +707,22 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return content
 
 
+class _PlainComposer(Composer):
+    """Refuses aliases: nine lines of them can stand for more values than there is memory, or for themselves."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """The next node of the document."""
+        if self.parser.check_event(AliasEvent):
+            event = self.parser.peek_event()
+            raise ComposerError("", event.start_mark, f"found the alias '{event.anchor}'; write the value out", event.start_mark)
+        return super().compose_node(parent, index)
+
+
 @cache
 def _parsed(text: str) -> Any:
-    return YAML(typ="safe", pure=True).load(text)
+    yaml = YAML(typ="safe", pure=True)
+    yaml.Composer = _PlainComposer
+    return yaml.load(text)
 
 
 def validate(kind: type[R], content: Any, path: Path, prefix: str = "") -> R:
@@ -714,7 +735,7 @@ def validate(kind: type[R], content: Any, path: Path, prefix: str = "") -> R:
         message = KEY_MESSAGES.get(first["type"])
         if message is None:
             found = first["input"]
-            shown = "" if isinstance(found, (dict, BaseModel)) else f", found {found!r}"
+            shown = "" if isinstance(found, (dict, BaseModel)) else f", found {repr(found)[:LONGEST]}"
             message = first["msg"][:1].lower() + first["msg"][1:] + shown
         where = f"key '{key}': " if key else ""  # a rule between keys names them itself
         raise ParameterError(f"{path}: {where}{message}") from error

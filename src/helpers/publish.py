@@ -122,9 +122,10 @@ def main() -> int:
     if inferred.is_dir():
         shutil.copytree(inferred, partial / "inferred_settings")
         shutil.copy2(first / "notebooks/00_inferred_settings.ipynb", partial / "notebooks")
-    for part in ("benchmarks", "inferred_settings"):  # runs of their own, which stay
-        if (REFERENCE / part).is_dir() and not (partial / part).is_dir():
-            shutil.copytree(REFERENCE / part, partial / part)
+    for part in ("benchmarks", "inferred_settings", "reliability.md"):  # runs of their own, which stay
+        if (REFERENCE / part).exists() and not (partial / part).exists():
+            copy = shutil.copytree if (REFERENCE / part).is_dir() else shutil.copy2
+            copy(REFERENCE / part, partial / part)
     shutil.rmtree(REFERENCE, ignore_errors=True)
     partial.rename(REFERENCE)
     readme.write_text(text, encoding="utf-8")

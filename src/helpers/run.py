@@ -3,8 +3,10 @@
 import argparse
 import os
 import re
+import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -16,6 +18,7 @@ sys.modules.setdefault("rfc3987_syntax", None)  # type: ignore[arg-type]
 
 import nbformat
 import papermill
+import psutil
 from nbclient.exceptions import DeadKernelError
 from papermill.exceptions import PapermillExecutionError
 from traitlets.config import Config
@@ -26,6 +29,7 @@ from helpers.scratch import beside, sweep
 from helpers.sources import PROJECT
 
 NOTEBOOKS = PROJECT / "notebooks"
+DAY = 86400.0  # seconds
 HEADLINE = "improved"  # the variant behind the report's numbers; cells with this tag are run for it alone
 
 
@@ -44,7 +48,8 @@ def execute(notebook: str, output: Path, parameters: dict[str, Any]) -> None:
     sweep(output)
     # Kernels started side by side race for TCP ports; where the platform has Unix sockets, a fresh folder for each
     # kernel's sockets avoids the race. Its path must stay short: socket names are limited to about 100 characters.
-    with tempfile.TemporaryDirectory(prefix="hk") as sockets:
+    _forget_dead_sockets()
+    with tempfile.TemporaryDirectory(prefix=f"hk{os.getpid()}_") as sockets:
         config = Config()
         # Papermill has every output by the time it stops the kernel, so the kernel need not take itself apart first.
         config.NotebookClient.shutdown_kernel = "immediate"
@@ -69,6 +74,23 @@ def execute(notebook: str, output: Path, parameters: dict[str, Any]) -> None:
             if partial.exists():
                 strip_machine(partial)
                 partial.replace(output)
+
+
+def _forget_dead_sockets() -> None:
+    """Remove the folders of sockets that killed runs of this machine left a day ago or earlier."""
+    for folder in Path(tempfile.gettempdir()).glob("hk*_*"):
+        found = re.match(r"hk(\d+)_", folder.name)
+        with suppress(OSError):
+            if found and not psutil.pid_exists(int(found[1])) and time.time() - folder.stat().st_mtime > DAY:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _forget_checkpoints(notebook: str, parameters: dict[str, Any]) -> None:
+    """Remove the checkpoints of a notebook that has ended: what it skipped may have been its last stage."""
+    place = [parameters.get(name) for name in ("scale", "seed", "case")]
+    if None not in place:  # as the Snakefile gives them; a run by hand keeps its few files until the stage is run again
+        folder = Path(parameters.get("output_root") or PROJECT / "results") / "{}/seed_{}/case_{}".format(*place)
+        shutil.rmtree(folder / f".checkpoints_{notebook}_{parameters.get('variant', HEADLINE)}", ignore_errors=True)
 
 
 def strip_machine(path: Path) -> None:
@@ -127,6 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         sentence = f"{what}: {error.filename or given.output}: could not be written: {error.strerror or error}"
     else:
+        _forget_checkpoints(given.notebook, parameters)
         print(f"done: {what}")
         return 0
     print(f"error: {sentence}", file=sys.stderr)

@@ -1,8 +1,8 @@
 """Names for what is being written: a process writes beside its target and renames, and what killed ones left is swept away."""
 
 import os
+import platform
 import shutil
-import socket
 from pathlib import Path
 
 import psutil
@@ -25,4 +25,4 @@ def sweep(path: Path) -> None:
 
 
 def _prefix(path: Path) -> str:
-    return f".{path.stem}.{socket.gethostname()}."
+    return f".{path.stem}.{platform.node()}."

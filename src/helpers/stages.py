@@ -61,6 +61,8 @@ def load_policy(session: Session, stage: str, made_by: str, case: int | None = N
     if weights["feature"].tolist() != session.feature_names or not pd.api.types.is_numeric_dtype(weights["alpha"]):
         raise ArtifactError(f"{found.path('weights.csv')}: expected a number for each of {', '.join(session.feature_names)}")
     alpha = torch.tensor(weights["alpha"].to_numpy(), dtype=session.dtype)
+    if not alpha.isfinite().all():
+        raise ArtifactError(f"{found.path('weights.csv')}: column 'alpha': expected finite numbers")
     return found.policy(session.params.learning, session.task), alpha
 
 

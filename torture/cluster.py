@@ -1,0 +1,190 @@
+"""The smoke run through SLURM: `python -m torture.cluster`, as root on Debian; `make cluster` runs it.
+
+It installs Debian's packages where they are missing, starts a SLURM of one node on loopback with all its files in a temporary
+folder, runs three case studies with four seeds through the profile in profiles/slurm, compares every result with that of a
+local run to the last bit, and stops what it started. Packages stay installed.
+"""
+
+import argparse
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from torture.runs import Place
+
+PACKAGES = ("slurmctld", "slurmd", "slurm-client", "munge")
+PROFILE = "profiles/slurm/without_accounting"
+PATIENCE = 120.0  # seconds for the node to come up
+CONFIGURATION = """\
+ClusterName=loopback
+SlurmctldHost={host}(127.0.0.1)
+SlurmctldPort={controller}
+SlurmdPort={daemon}
+SlurmUser=root
+SlurmdUser=root
+AuthType=auth/munge
+AuthInfo=socket={folder}/munge.socket
+StateSaveLocation={folder}/state
+SlurmdSpoolDir={folder}/spool
+SlurmctldPidFile={folder}/slurmctld.pid
+SlurmdPidFile={folder}/slurmd.pid
+SlurmctldLogFile={folder}/slurmctld.log
+SlurmdLogFile={folder}/slurmd.log
+ProctrackType=proctrack/linuxproc
+TaskPlugin=task/none
+MpiDefault=none
+SelectType=select/cons_tres
+SelectTypeParameters=CR_Core
+AccountingStorageType=accounting_storage/none
+JobAcctGatherType=jobacct_gather/none
+PropagatePrioProcess=1
+NodeName={host} NodeAddr=127.0.0.1 CPUs={cores} RealMemory={memory} State=UNKNOWN
+PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
+"""
+
+
+class SkipError(RuntimeError):
+    """SLURM is not to be had here; one sentence says why."""
+
+
+def install() -> None:
+    """Debian's packages, if they are not there yet.
+
+    Raises:
+        SkipError: if they cannot be had.
+    """
+    if all(shutil.which(program) for program in ("slurmctld", "slurmd", "sbatch", "munged")):
+        return
+    if os.geteuid() != 0 or not shutil.which("apt-get"):
+        raise SkipError("installing SLURM needs root and apt-get")
+    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    for words in (["update", "-qq"], ["install", "-y", "-qq", "--no-install-recommends", *PACKAGES]):
+        done = subprocess.run(["apt-get", *words], env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SkipError(f"apt-get could not install {', '.join(PACKAGES)}: {done.stderr.strip().splitlines()[-1:]}")
+
+
+@contextmanager
+def one_node(folder: Path) -> Iterator[dict[str, str]]:
+    """A SLURM of one node on loopback while the context lasts; gives the environment in which its commands find it.
+
+    Raises:
+        SkipError: if it does not come up.
+    """
+    host, memory = socket.gethostname().split(".")[0], os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20
+    for name in ("state", "spool"):
+        (folder / name).mkdir()
+    configuration = folder / "slurm.conf"
+    controller, daemon = _free_ports(2)
+    values = {
+        "host": host,
+        "folder": folder,
+        "cores": os.cpu_count(),
+        "memory": memory * 9 // 10,
+        "controller": controller,
+        "daemon": daemon,
+    }
+    configuration.write_text(CONFIGURATION.format(**values), encoding="utf-8")
+    key = folder / "munge.key"
+    key.write_bytes(os.urandom(1024))
+    key.chmod(0o600)
+    environment = {"SLURM_CONF": str(configuration)}
+    places = {"key-file": "key", "socket": "socket", "pid-file": "pid", "log-file": "log", "seed-file": "seed"}
+    munge = [f"--{option}={folder}/munge.{ending}" for option, ending in places.items()]
+    commands = [["munged", "--foreground", "--force", *munge]]
+    commands += [["slurmctld", "-D", "-f", str(configuration)], ["slurmd", "-D", "-f", str(configuration), "-N", host]]
+    started: list[subprocess.Popen[bytes]] = []
+    with (folder / "daemons.log").open("wb") as log:
+        try:
+            for command in commands:
+                started.append(subprocess.Popen(command, env={**os.environ, **environment}, stdout=log, stderr=subprocess.STDOUT))
+                time.sleep(1.0)
+            _wait_until_idle(environment, folder)
+            yield environment
+        finally:
+            for process in reversed(started):
+                process.send_signal(signal.SIGTERM)
+            for process in reversed(started):
+                try:
+                    process.wait(20)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
+
+
+def _free_ports(number: int) -> list[int]:
+    sockets = [socket.socket() for _ in range(number)]
+    try:
+        for one in sockets:
+            one.bind(("127.0.0.1", 0))
+        return [one.getsockname()[1] for one in sockets]
+    finally:
+        for one in sockets:
+            one.close()
+
+
+def _wait_until_idle(environment: dict[str, str], folder: Path) -> None:
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        found = subprocess.run(
+            ["sinfo", "-h", "-o", "%T"], env={**os.environ, **environment}, capture_output=True, text=True, check=False
+        )
+        if found.stdout.strip() == "idle":
+            return
+        time.sleep(1.0)
+    tail = (folder / "daemons.log").read_text(encoding="utf-8", errors="replace").strip()[-1500:]
+    raise SkipError(f"the node did not come up within {PATIENCE:.0f} s: {found.stdout}{found.stderr}\n{tail}")
+
+
+def compare(seeds: int, targets: Sequence[str], environment: dict[str, str], folder: Path) -> tuple[int, int, float, float]:
+    """The same run here and through SLURM: results, those that differ, and the seconds of both."""
+    local = Place.copied(folder / "local", seeds=seeds, targets=tuple(targets))
+    cluster = replace(Place.copied(folder / "cluster", seeds=seeds, targets=tuple(targets)), profile=PROFILE)
+    seconds = []
+    for place, extra in ((local, {}), (cluster, environment)):
+        began = time.perf_counter()
+        with (place.project / "said.log").open("wb") as log:
+            status = place.start(output=log, **extra).wait()
+        seconds.append(time.perf_counter() - began)
+        if status:
+            words = (place.project / "said.log").read_text(encoding="utf-8", errors="replace")
+            raise RuntimeError(f"the run in {place.project.name}/ failed:\n{words[-3000:]}")
+    here, there = local.content(), cluster.content()
+    differing = sum(there.get(name) != content for name, content in here.items()) + len(there.keys() - here.keys())
+    return len(here), differing, seconds[0], seconds[1]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status: 0 also where SLURM is not to be had, unless it is required."""
+    parser = argparse.ArgumentParser(prog="python -m torture.cluster", description="The smoke run through SLURM, and here.")
+    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--case", type=int, help="only the offline learning of this case")
+    parser.add_argument("--required", action="store_true", help="fail where SLURM is not to be had")
+    given = parser.parse_args(arguments)
+    names = range(given.seeds) if given.case else ()
+    targets = [f"results/smoke/seed_{seed}/case_{given.case}/offline_improved/record.json" for seed in names]
+    try:
+        install()
+        with tempfile.TemporaryDirectory(prefix="slurm") as name:
+            folder = Path(name)
+            with one_node(folder) as environment:
+                number, differing, here, there = compare(given.seeds, targets, environment, folder)
+    except SkipError as error:
+        print(f"SKIPPED: the run through SLURM: {error}", flush=True)
+        return 1 if given.required else 0
+    times = f"{here:.0f} s here, {there:.0f} s through SLURM"
+    print(f"{number} results of {given.seeds} seed(s): {differing} differ; {times}", flush=True)
+    return 1 if differing else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

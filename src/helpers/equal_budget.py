@@ -142,19 +142,17 @@ def retuned(contest: Contest) -> Learned:
         return PID(found, run.task.set_point, run.params.process.sampling_time)
 
     visitor(0, pid(start, session))
-    episodes, mean = 0, first
-    while episodes < contest.scale.episodes:
-        points = search.ask()
-        costs = []
+    spent, mean = 0, first
+    while spent + params.episodes * search.popsize <= contest.scale.episodes:
+        points, costs = search.ask(), []
         for point in points:
             batch = rollout(session.process, pid(gains(point), session), session.task, params.episodes, generator)
             costs.append(-contest.returns(batch).mean().item())
         search.tell(points, costs)
-        before, episodes = episodes, episodes + params.episodes * len(points)
+        before, spent = spent, spent + params.episodes * len(points)
         mean = np.maximum(search.mean, 0)
-        passed = episodes - episodes % contest.scale.every
-        if before < passed <= contest.scale.episodes:
-            visitor(passed, pid(gains(mean), session))
+        if before // contest.scale.every < spent // contest.scale.every:
+            visitor(spent, pid(gains(mean), session))
     return Learned(partial(pid, gains(mean)), visitor.curve)
 
 

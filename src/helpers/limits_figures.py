@@ -9,13 +9,14 @@ import pandas as pd
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from helpers.figures import INK, KIND_STYLES, LOOP_COLOURS, MUTED, WIDTH, empty_figure
 
 LABELS = {
     "expert": "PID (demonstrator)",
     "offline": "offline policy",
-    "online": "online policy, 2,000 episodes",
+    "online": "online policy",
     "online_there": "improved on that plant",
     "clone": "cloning",
     "irl_reinforce": "IRL, then REINFORCE",
@@ -140,8 +141,9 @@ def regret_figure(episodes: pd.DataFrame) -> Figure:
         left.plot(worst.index, worst["objective"], label=words[str(run)], marker="o", markersize=3, **style)
         right.plot(group["episode"], (group["expert"] - group["objective"]).cumsum(), label=words[str(run)], **style)
     left.plot(worst.index, worst["expert"], color=MUTED, linestyle=KIND_STYLES[2], label="PID, same disturbances")
+    left.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     left.set(xlabel="epoch", ylabel="$J$ of the worst episode (no unit)")
-    right.set(xlabel="plant episode", ylabel="cumulative regret against the PID (no unit)")
+    right.set(xlabel="plant episode", ylabel="cumulative regret\nagainst the PID (no unit)")
     for axes, letter, name in ((left, "A", "worst episode"), (right, "B", "regret")):
         axes.set_title(f"$\\mathbf{{{letter}}}$  {name[:1].upper()}{name[1:]}", loc="left")
         axes.set_label(f"{letter} {name}")

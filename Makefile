@@ -32,7 +32,8 @@ reports: setup  ## run everything at paper scale and write reports/latest/report
 	@echo "The report: $(CURDIR)/reports/latest/report.html"
 
 evidence: SEEDS = 20
-evidence: setup  ## twenty seeds of it, the claims, the trials and the inferred settings; resumable
+evidence: setup  ## twenty seeds of it, the claims, the limits, the trials and the inferred settings; resumable
+	$(BIN)/python -m pip install --quiet --constraint environment.txt --editable ".[alternatives]"
 	$(SNAKEMAKE) --config seeds=$(SEEDS) scale=$(SCALE) missing=$(MISSING) evidence=1 $(if $(filter smoke,$(SCALE)),reports=results/smoke/report)
 
 smoke: setup  ## the same in seconds, with few epochs; the report goes to results/smoke/report/

@@ -193,11 +193,28 @@ rule claims:
         f"{RUN} 08_claims {{log:q}} -p case {{wildcards.case}} -p seed {{wildcards.seed}} {ROOTS}"
 
 
+rule limits:
+    input:
+        sources("06_limits_and_alternatives", "experiments", "limits"),
+        demonstrations=f"{CASE}/demonstrations/record.json",
+        offline=f"{CASE}/offline_improved/record.json",
+        transfer=lambda wildcards: [f"{CASE}/transfer_improved/record.json"] if wildcards.case == "3" else [],
+        online=f"{CASE}/online_improved/record.json",
+    output:
+        [f"{CASE}/limits_{part}/record.json" for part in ("attainable", "budget", "quality", "robustness", "safety")],
+    log:
+        f"{LOG}/06_limits_and_alternatives.ipynb",
+    priority: -2
+    shell:
+        f"{RUN} 06_limits_and_alternatives {{log:q}} -p case {{wildcards.case}} -p seed {{wildcards.seed}} {ROOTS}"
+
+
 def evidence():
     """The runs beyond the paper's own."""
     folder = f"{RESULTS}/{SCALE}"
     stages = [f"{folder}/seed_0/inferred_settings/record.json"]
     stages += [f"{folder}/seed_{seed}/case_{case}/experiments/record.json" for seed in SEEDS for case in CASES]
+    stages += [f"{folder}/seed_{seed}/case_{case}/limits_safety/record.json" for seed in SEEDS for case in CASES]
     for seed in TRIAL_SEEDS:
         for trial in TRIALS:
             stages += [f"{folder}/seed_{seed}/case_{case}/offline_{trial}/record.json" for case in (1, 2)]

@@ -1,0 +1,60 @@
+"""The control task of a case study as a gymnasium environment with the real objective, for learners of other libraries.
+
+It needs the packages of the extra `alternatives`.
+"""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from helpers.params import PolicyParams
+from helpers.process import LinearProcess
+from helpers.task import ControlTask
+
+
+class TrackingEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One episode of T samples: Eq. 4.1.3-4.1.4 with the reward of Eq. 5.1.2.1 on the true state.
+
+    Written in numpy, which is faster than torch on single vectors. An agent sees what the policy of Section 3.2 sees (the error
+    of each loop in its unit and the previous input, scaled so that the bounds are -1 and 1) and acts in -1..1. The horizon
+    belongs to the task, so that its end is terminal.
+
+    Attributes:
+        beta: sharpness of the reward; may be changed between episodes.
+    """
+
+    def __init__(self, process: LinearProcess, task: ControlTask, policy: PolicyParams, beta: float) -> None:
+        self.beta = beta
+        self.n_steps = task.n_steps
+        self.state_step, self.input_step = process.state_step.double().numpy(), process.input_step.double().numpy()
+        self.disturbance_step = process.disturbance_gain.double().numpy() * process.sampling_time**0.5
+        self.observation_noise = process.observation_noise.double().numpy()
+        self.set_point, self.error_scale = task.set_point.double().numpy(), task.error_scale.double().numpy()
+        self.initial_mean, self.initial_std = task.initial_mean.double().numpy(), task.initial_std.double().numpy()
+        low, high = task.input_low.double().numpy(), task.input_high.double().numpy()
+        self.middle, self.half = (high + low) / 2, (high - low) / 2
+        self.error_unit = np.array(policy.error_unit)
+        n_seen = len(self.set_point) + len(self.middle)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (n_seen,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(self.middle),), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """A fresh episode; the input before it was u* = 0."""
+        super().reset(seed=seed)
+        self.t = 0
+        self.x = self.initial_mean + self.initial_std * self.np_random.standard_normal(len(self.initial_mean))
+        return self._seen(np.zeros_like(self.middle)), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One sample; `info` holds the true state x and the input u as applied."""
+        u = self.middle + self.half * np.clip(action, -1.0, 1.0)
+        noise = self.np_random.standard_normal(len(self.x))
+        self.x = self.state_step @ self.x + self.input_step @ u + self.disturbance_step * self.x * noise
+        reward = np.exp(-((self.beta * (self.set_point - self.x) / self.error_scale) ** 2)).sum()
+        self.t += 1
+        return self._seen(u), float(reward), self.t == self.n_steps, False, {"x": self.x, "u": u}
+
+    def _seen(self, u: np.ndarray) -> np.ndarray:
+        y = self.x * (1 + self.observation_noise * self.np_random.standard_normal(len(self.x)))
+        return np.concatenate([(self.set_point - y) / self.error_unit, (u - self.middle) / self.half]).astype(np.float32)

@@ -1,0 +1,118 @@
+"""PPO and RecurrentPPO of stable-baselines3 and sb3-contrib on the real objective.
+
+It needs the packages of the extra `alternatives`.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv
+from torch import Tensor
+
+from helpers.gym_environment import TrackingEnv
+from helpers.limits_params import LibraryParams
+from helpers.params import PolicyParams
+from helpers.policy import Scaling
+from helpers.process import LinearProcess
+from helpers.task import ControlTask
+
+NAMES = ("ppo", "recurrent_ppo")
+
+
+@dataclass
+class LibraryMemory:
+    """The network's own state, if it has one, and the input applied last (K, n_u)."""
+
+    state: Any
+    u_previous: Tensor
+    first: bool
+
+
+class LibraryController:
+    """The mode of a learned policy of the library, as a controller of this project."""
+
+    def __init__(self, model: OnPolicyAlgorithm, task: ControlTask, scaling: Scaling) -> None:
+        self.model = model
+        self.task = task
+        self.scaling = scaling
+
+    def start(self, n_trajectories: int, n_steps: int, generator: torch.Generator) -> LibraryMemory:
+        """No state yet, and the input at u* = 0."""
+        return LibraryMemory(None, self.task.input_low.new_zeros(n_trajectories, len(self.task.input_low)), True)
+
+    def act(self, observation: Tensor, memory: LibraryMemory) -> tuple[Tensor, LibraryMemory]:
+        """The network's action mapped from -1..1 onto the bounds."""
+        seen = self.scaling.inputs(observation, memory.u_previous).float().numpy()
+        starts = np.full(len(seen), memory.first)
+        action, state = self.model.predict(seen, state=memory.state, episode_start=starts, deterministic=True)
+        low, high = self.task.input_low, self.task.input_high
+        u = (high + low) / 2 + (high - low) / 2 * torch.from_numpy(action).to(observation.dtype)
+        return u, LibraryMemory(state, u, False)
+
+
+class _BetweenEpochs(BaseCallback):
+    """Calls `visit` with the number of finished episodes before each batch is collected, and sets the sharpness of the reward."""
+
+    def __init__(self, visit: Callable[[int], None], beta_at: Callable[[int], float], n_steps: int) -> None:
+        super().__init__()
+        self.visit = visit
+        self.beta_at = beta_at
+        self.n_steps_of_episode = n_steps
+
+    def _on_rollout_start(self) -> None:
+        episodes = self.num_timesteps // self.n_steps_of_episode
+        self.training_env.set_attr("beta", self.beta_at(episodes))
+        self.visit(episodes)
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def library_learner(
+    name: str,
+    process: LinearProcess,
+    task: ControlTask,
+    policy: PolicyParams,
+    params: LibraryParams,
+    discount: float,
+    episodes: int,
+    seed: int,
+) -> OnPolicyAlgorithm:
+    """A fresh learner: PPO with a network of its own without memory, or RecurrentPPO with the layers of Section 3.2.
+
+    Args:
+        episodes: of a batch, each in an environment of its own.
+    """
+    environments = DummyVecEnv([lambda: TrackingEnv(process, task, policy, 1.0)] * episodes)
+    deviation = math.log(2 * params.initial_std)  # the actions' range is two
+    common: dict[str, Any] = {
+        "n_steps": task.n_steps,
+        "batch_size": max(2, task.n_steps * episodes // params.minibatches),
+        "n_epochs": params.passes,
+        "learning_rate": lambda remaining: remaining * params.learning_rate,
+        "gamma": discount,
+        "gae_lambda": params.gae_decay,
+        "seed": seed,
+        "device": "cpu",
+    }
+    if name == "ppo":
+        return PPO("MlpPolicy", environments, policy_kwargs={"net_arch": list(params.network), "log_std_init": deviation}, **common)
+    cells = policy.hidden_cells
+    layers = {"lstm_hidden_size": cells[0], "n_lstm_layers": len(cells), "net_arch": [], "log_std_init": deviation}
+    return RecurrentPPO("MlpLstmPolicy", environments, policy_kwargs=layers, **common)
+
+
+def learn(
+    model: OnPolicyAlgorithm, task: ControlTask, n_episodes: int, beta_at: Callable[[int], float], visit: Callable[[int], None]
+) -> None:
+    """Learn from so many episodes; `visit` is called with the episodes spent, before each batch and at the end."""
+    model.learn(n_episodes * task.n_steps, callback=_BetweenEpochs(visit, beta_at, task.n_steps))
+    visit(model.num_timesteps // task.n_steps)

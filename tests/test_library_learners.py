@@ -1,0 +1,71 @@
+"""The gymnasium environment against this project's own rollout, and learners of libraries as controllers of this project."""
+
+import numpy as np
+import pytest
+import torch
+
+gymnasium = pytest.importorskip("gymnasium")
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
+
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+from helpers.features import tracking_reward  # noqa: E402
+from helpers.gym_environment import TrackingEnv  # noqa: E402
+from helpers.library_learners import LibraryController, learn, library_learner  # noqa: E402
+from helpers.limits_params import load_limits  # noqa: E402
+from helpers.randomness import stream  # noqa: E402
+from helpers.rollout import rollout  # noqa: E402
+
+
+@pytest.fixture
+def make(study):
+    def build(**process):
+        case = study(1, process=process)
+        return case, TrackingEnv(case.process, case.task, case.params.learning.policy, 10.0)
+
+    return build
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # the observations are not bounded, by nature
+def test_gymnasium_finds_nothing_wrong(make):
+    check_env(make()[1], skip_render_check=True)
+
+
+def test_an_episode_is_that_of_the_process(make):
+    """Without noise: states, rewards and what is seen, step by step through the process itself."""
+    case, env = make(disturbance=(0.0, 0.0), observation_noise=(0.0, 0.0))
+    seen, _ = env.reset(seed=3)
+    x = torch.tensor(env.x)[None]
+    scaling = case.policy().scaling(case.task)
+    previous = torch.zeros_like(case.task.input_low)[None]
+    for t in range(case.task.n_steps):
+        assert seen == pytest.approx(scaling.inputs(x, previous)[0].numpy(), rel=1e-5, abs=1e-6)
+        action = np.array([0.3, -1.7])  # the second lies beyond the bound
+        seen, reward, over, cut, info = env.step(action)
+        low, high = case.task.input_low, case.task.input_high
+        previous = ((high + low) / 2 + (high - low) / 2 * torch.tensor([0.3, -1.0]))[None]
+        x = case.process.step(x, previous, torch.zeros_like(x))
+        assert info["x"] == pytest.approx(x[0].numpy())
+        assert info["u"] == pytest.approx(previous[0].numpy())
+        error = (case.task.set_point - x) / case.task.error_scale
+        assert reward == pytest.approx(tracking_reward(error, 10.0).item(), abs=1e-12)
+        assert (over, cut) == (t == case.task.n_steps - 1, False)
+
+
+@pytest.mark.parametrize("name", ["ppo", "recurrent_ppo"])
+def test_learners_learn_and_become_controllers(study, root, name):
+    case = study(1)
+    params = getattr(load_limits(root, case.params), name).model_copy(update={"passes": 1, "minibatches": 2})
+    model = library_learner(name, case.process, case.task, case.params.learning.policy, params, 0.99, 4, 0)
+    visits, betas = [], []
+    before = [weight.clone() for weight in model.policy.parameters()]
+    learn(model, case.task, 8, lambda episodes: betas.append(episodes) or 10.0, visits.append)
+    assert visits == [0, 4, 8]
+    assert betas == [0, 4]
+    assert any(not torch.equal(old, new) for old, new in zip(before, model.policy.parameters(), strict=True))
+    controller = LibraryController(model, case.task, case.policy().scaling(case.task))
+    batch = rollout(case.process, controller, case.task, 3, stream(0, "library"))
+    assert batch.u.isfinite().all()
+    again = rollout(case.process, controller, case.task, 3, stream(0, "library"))
+    assert torch.equal(batch.u, again.u)  # its mode, from a fresh state

@@ -3,6 +3,7 @@
 The hidden states of the network are inputs and outputs of the file, so that it keeps no memory; scaling and bounds are inside.
 """
 
+import copy
 import json
 import warnings
 from dataclasses import dataclass
@@ -33,17 +34,17 @@ class PolicyStep(nn.Module):
 
     def __init__(self, policy: LSTMPolicy, task: ControlTask, steady_y: Tensor, steady_u: Tensor) -> None:
         super().__init__()
-        self.layers, self.output, self.slope = policy.layers, policy.output, policy.params.leaky_slope
+        single = copy.deepcopy(policy).float()  # onnxruntime has no LSTM in double precision
+        self.layers, self.output, self.slope = single.layers, single.output, policy.params.leaky_slope
         self.n_inputs = policy.n_manipulated
         self.error_unit = nn.Buffer(policy.error_unit.double())
         self.low = nn.Buffer(task.input_low.double() + steady_u)
         self.high = nn.Buffer(task.input_high.double() + steady_u)
-        self.single = policy.output.weight.dtype
 
     def forward(self, y: Tensor, set_point: Tensor, u_previous: Tensor, *states: Tensor) -> tuple[Tensor, ...]:
         """The input to apply, (K, n_u), and the states for the next sample, h and c of each layer, (1, K, cells)."""
         middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
-        signal = torch.cat([(set_point - y) / self.error_unit, (u_previous - middle) / half], dim=-1).to(self.single)[None]
+        signal = torch.cat([(set_point - y) / self.error_unit, (u_previous - middle) / half], dim=-1).float()[None]
         after: list[Tensor] = []
         for index, layer in enumerate(self.layers):
             hidden, state = layer(signal, (states[2 * index], states[2 * index + 1]))
@@ -66,7 +67,7 @@ def export(policy: LSTMPolicy, task: ControlTask, steady_y: Tensor, steady_u: Te
     """
     module = PolicyStep(policy, task, steady_y, steady_u).eval()
     names = state_names(policy)
-    states = [torch.zeros(1, 1, layer.hidden_size, dtype=module.single) for layer in policy.lstms for _ in ("h", "c")]
+    states = [torch.zeros(1, 1, layer.hidden_size) for layer in policy.lstms for _ in ("h", "c")]
     example = (steady_y.double()[None], steady_y.double()[None], steady_u.double()[None], *states)
     axes = {name: {0: "K"} for name in ("y", "set_point", "u_previous", "u")}
     axes |= {f"{name}{suffix}": {1: "K"} for name in names for suffix in ("", "_next")}
@@ -104,15 +105,12 @@ class DeployedPolicy:
             raise InputError(f"{self.path}: not a policy that can be run: {' '.join(str(error).split())[:200]}") from error
         self.names = [entry.name for entry in self.session.get_inputs()][3:]
         self.shapes = [entry.shape for entry in self.session.get_inputs()][3:]
-        self.types = [np.float64 if "double" in entry.type else np.float32 for entry in self.session.get_inputs()][3:]
         self.notes = {key: json.loads(value) for key, value in self.session.get_modelmeta().custom_metadata_map.items()}
         self.reset()
 
     def reset(self, n_trajectories: int = 1) -> None:
         """Zero hidden states, as before the first sample of an episode."""
-        self.states = [
-            np.zeros((shape[0], n_trajectories, shape[2]), dtype=kind) for shape, kind in zip(self.shapes, self.types, strict=True)
-        ]
+        self.states = [np.zeros((shape[0], n_trajectories, shape[2]), dtype=np.float32) for shape in self.shapes]
 
     def step(self, y: Array, set_point: Array, u_previous: Array) -> Array:
         """The input for this sample, (K, n_u), from measurement, set point and the input applied last; engineering units."""

@@ -3,11 +3,12 @@
 Unlike the parameter files it has no sources and statuses: its author knows the plant.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import Field, Strict, model_validator
 from pydantic_core import PydanticCustomError
 from torch import Tensor
 
@@ -17,35 +18,38 @@ from helpers.task import ControlTask
 SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 
-def _check_range(record: "ControlledVariable | ManipulatedVariable") -> None:
-    if not record.low < record.high:
-        raise PydanticCustomError("range", "'low' must lie below 'high'")
-    if not record.low <= record.steady_state <= record.high:
-        raise PydanticCustomError("range", "'steady_state' lies outside 'low' to 'high'")
-
-
-class ControlledVariable(Record):
-    """A measured variable with a set point; engineering units.
-
-    Attributes:
-        low, high: between which a measurement is possible. steady_state: y_ss, before the set point moves.
-        set_point: y_sp, that of the task to be learned. error_scale: y_sp - y_ss, needed where the set point does not move.
-    """
+class Variable(Record):
+    """A column of numbers; engineering units. `low` and `high` bound what is possible; `steady_state` is where the plant rests."""
 
     name: Text
-    description: Text = ""
+    description: Annotated[str, Strict()] = ""
     tag: Text
-    set_point_tag: Text | None = None
     unit: Text
     low: Real
     high: Real
     steady_state: Real
+
+    @model_validator(mode="after")
+    def _in_range(self) -> Self:
+        if not self.low < self.high:
+            raise PydanticCustomError("range", "'low' must lie below 'high'")
+        if not self.low <= self.steady_state <= self.high:
+            raise PydanticCustomError("range", "'steady_state' lies outside 'low' to 'high'")
+        return self
+
+
+class ControlledVariable(Variable):
+    """A measured variable. `set_point` is y_sp of the task to be learned and `steady_state` y_ss, before the set point moves.
+
+    `error_scale`, y_sp - y_ss otherwise, is needed where the set point does not move.
+    """
+
+    set_point_tag: Text | None = None
     set_point: Real
     error_scale: NotZero | None = None
 
     @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        _check_range(self)
+    def _scaled(self) -> Self:
         if self.error_scale is None and self.set_point == self.steady_state:
             raise PydanticCustomError("scale", "'set_point' equals 'steady_state', so the error has no scale: give 'error_scale'")
         return self
@@ -56,22 +60,10 @@ class ControlledVariable(Record):
         return self.set_point - self.steady_state if self.error_scale is None else self.error_scale
 
 
-class ManipulatedVariable(Record):
-    """An input with its bounds; engineering units. `rate` is the greatest move from one sample to the next, if any."""
+class ManipulatedVariable(Variable):
+    """An input between its bounds. `rate` is the greatest move from one sample to the next, if there is one."""
 
-    name: Text
-    description: Text = ""
-    tag: Text
-    unit: Text
-    low: Real
-    high: Real
-    steady_state: Real
     rate: Positive | None = None
-
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        _check_range(self)
-        return self
 
 
 class LoopGains(Record):
@@ -116,14 +108,12 @@ class PlantDescription(Record):
             doubled = next((word for word in words if words.count(word) > 1), None)
             if doubled is not None:
                 raise PydanticCustomError("double", "the {kind} '{word}' occurs twice", {"kind": kind, "word": doubled})
+        outputs, inputs = ([variable.name for variable in known] for known in (self.controlled, self.manipulated))
         for loop in self.pid:
-            for key, known in (("controlled", self.controlled), ("manipulated", self.manipulated)):
-                if getattr(loop, key) not in [variable.name for variable in known]:
-                    raise PydanticCustomError(
-                        "pid",
-                        "'pid' names the {key} variable '{name}', which is not described",
-                        {"key": key, "name": getattr(loop, key)},
-                    )
+            for key, name, known in (("controlled", loop.controlled, outputs), ("manipulated", loop.manipulated, inputs)):
+                if name not in known:
+                    found: dict[str, Any] = {"key": key, "name": name}
+                    raise PydanticCustomError("pid", "'pid' names the {key} variable '{name}', which is not described", found)
         return self
 
     @property
@@ -139,7 +129,7 @@ class PlantDescription(Record):
 
     def steady(self, kind: Literal["controlled", "manipulated"], dtype: torch.dtype = torch.float64) -> Tensor:
         """y_ss or u_ss in engineering units, shape (n_y,) or (n_u,)."""
-        variables = self.controlled if kind == "controlled" else self.manipulated
+        variables: Sequence[Variable] = self.controlled if kind == "controlled" else self.manipulated
         return torch.tensor([variable.steady_state for variable in variables], dtype=dtype)
 
     def task(self, initial_mean: Tensor, initial_std: Tensor, dtype: torch.dtype) -> ControlTask:

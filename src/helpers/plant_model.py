@@ -4,7 +4,7 @@ Each is a `process.Process` in deviation variables.
 """
 
 import importlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any
 
@@ -18,52 +18,47 @@ from helpers.process import Process
 GYMNASIUM = "gymnasium:"
 
 
-@dataclass(frozen=True)
+@dataclass
 class LinearModel:
     """A discrete-time linear state-space model with its disturbance and its measurement noise.
 
-    x_{t+1} = A x_t + B u_t + c + sqrt(Q) w_t, y_t = C x_t + sqrt(R) v_t with w, v ~ N(0, I); one step is one sample.
+    x_{t+1} = A x_t + B u_t + c + s_w(x_t) w_t, y_t = C x_t + s_v(x_t) v_t with w, v ~ N(0, I); one step is one sample.
+    Both standard deviations have a fixed part and one that grows with the deviation as in Eq. 4.1.3c and 4.1.4b:
+    s(x)^2 = fixed^2 + (gain x)^2.
 
     The first n_y states are the outputs without noise, so C is (I, 0); with more than one lag the states also hold
     earlier outputs and inputs.
 
     Attributes:
         state_step: A (n_x, n_x). input_step: B (n_x, n_u). constant: c (n_x,).
-        disturbance: square roots of the diagonal of Q, (n_x,). noise: the same of R, (n_y,).
+        disturbance, disturbance_gain: of s_w, (n_x,). noise, noise_gain: of s_v, (n_y,).
     """
 
     state_step: Tensor
     input_step: Tensor
     constant: Tensor
     disturbance: Tensor
+    disturbance_gain: Tensor
     noise: Tensor
+    noise_gain: Tensor
 
-    @property
-    def n_states(self) -> int:
-        """n_x."""
-        return len(self.state_step)
-
-    @property
-    def n_outputs(self) -> int:
-        """n_y."""
-        return len(self.noise)
-
-    @property
-    def n_inputs(self) -> int:
-        """n_u."""
-        return self.input_step.shape[1]
+    def __post_init__(self) -> None:
+        self.n_states, self.n_inputs = self.input_step.shape
+        self.n_outputs = len(self.noise)
 
     def step(self, x: Tensor, u: Tensor, noise: Tensor) -> Tensor:
         """The next state, shape (K, n_x)."""
-        return torch.addmm(self.constant + self.disturbance * noise, x, self.state_step.T).addmm_(u, self.input_step.T)
+        kick = (self.disturbance**2 + (self.disturbance_gain * x) ** 2).sqrt() * noise
+        return torch.addmm(self.constant + kick, x, self.state_step.T).addmm_(u, self.input_step.T)
 
     def observe(self, x: Tensor, noise: Tensor) -> Tensor:
         """The outputs, shape (K, n_y)."""
-        return x[:, : self.n_outputs] + self.noise * noise
+        outputs = x[:, : self.n_outputs]
+        return outputs + (self.noise**2 + (self.noise_gain * outputs) ** 2).sqrt() * noise
 
     def to(self, dtype: torch.dtype) -> "LinearModel":
         """The same in another number type."""
-        return LinearModel(*(value.to(dtype) for value in vars(self).values()))
+        return LinearModel(*(getattr(self, entry.name).to(dtype) for entry in fields(self)))
 
 
 class GymnasiumPlant:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 from statsmodels.stats.diagnostic import acorr_ljungbox
 from statsmodels.tsa.statespace.mlemodel import MLEModel
 
@@ -194,7 +195,7 @@ def identify(
     lags = min(fits, key=lambda number: float(fits[number][0]))
     _, vector, errors, likelihood = fits[lags]
     a, b, c, _, _ = likelihood.split(vector)
-    model = _state_space(likelihood, vector, scales)
+    model = _state_space(likelihood, vector, scales, spread_of(likelihood, vector))
     warnings = []
     largest = float(np.abs(np.linalg.eigvals(model.state_step.numpy())).max())
     if largest >= 1:
@@ -216,7 +217,28 @@ def identify(
     )
 
 
-def _state_space(likelihood: VectorARX, vector: Array, scales: tuple[Array, Array]) -> LinearModel:
+def spread_of(likelihood: VectorARX, vector: Array) -> Array:
+    """How the variance of the one-step errors grows with the deviation, (n_y, 2): a share a + b z^2 of its mean.
+
+    Least squares on the squared residuals with a, b >= 0, weighted once by what the first pass found.
+    """
+    likelihood.update(vector)
+    found = likelihood.ssm.filter()
+    variance = np.einsum("iit->ti", found.forecasts_error_cov)
+    share = (found.forecasts_error.T**2 / variance)[1:][~likelihood.last[:-1]]
+    square = (found.forecasts.T**2)[1:][~likelihood.last[:-1]]
+    rows = []
+    for values, regressor in zip(share.T, square.T, strict=True):
+        design = np.column_stack([np.ones_like(regressor), regressor])
+        fitted = np.ones_like(values)
+        for _ in range(2):
+            solution, _ = nnls(design / fitted[:, None], values / fitted)
+            fitted = np.maximum(design @ solution, 0.05 * values.mean())
+        rows.append(solution)
+    return np.array(rows)
+
+
+def _state_space(likelihood: VectorARX, vector: Array, scales: tuple[Array, Array], spread: Array) -> LinearModel:
     """The model in deviation variables; with lags the state is (z_t, z_{t-1}, .., u_{t-1}, ..)."""
     a, b, c, w, v = likelihood.split(vector)
     n_y, n_u, lags = likelihood.n_y, likelihood.n_u, likelihood.lags
@@ -231,8 +253,16 @@ def _state_space(likelihood: VectorARX, vector: Array, scales: tuple[Array, Arra
     input_step[:n_y] = b[:, :n_u]
     input_step[n_z : n_z + n_u] = np.eye(n_x - n_z, n_u)[:n_u]
     pad = np.zeros(n_x - n_y)
-    arrays = (state_step, input_step, np.concatenate([c * y_scale, pad]), np.concatenate([w * y_scale, pad]), v * y_scale)
-    return LinearModel(*(torch.tensor(array) for array in arrays))
+    fixed, gain = np.sqrt(spread).T
+    return LinearModel(
+        state_step=torch.tensor(state_step),
+        input_step=torch.tensor(input_step),
+        constant=torch.tensor(np.concatenate([c * y_scale, pad])),
+        disturbance=torch.tensor(np.concatenate([w * y_scale * fixed, pad])),
+        disturbance_gain=torch.tensor(np.concatenate([w * gain, pad])),
+        noise=torch.tensor(v * y_scale * fixed),
+        noise_gain=torch.tensor(v * gain),
+    )
 
 
 @dataclass(frozen=True)

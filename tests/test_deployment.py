@@ -32,9 +32,9 @@ def deployed(request, tmp_path, root):
 
 def recorded(task, n_steps=50, n_episodes=20):
     """Observations and inputs that go everywhere, beyond the bounds of what a plant does."""
-    y = task.set_point + 2 * torch.randn(n_steps + 1, n_episodes, len(task.set_point), generator=stream(0, "y"), dtype=torch.float64)
+    draws = torch.randn(n_steps + 1, n_episodes, len(task.set_point), generator=stream(0, "y"), dtype=torch.float64)
     share = torch.rand(n_steps, n_episodes, len(task.input_low), generator=stream(0, "u"), dtype=torch.float64)
-    return y, task.input_low + (task.input_high - task.input_low) * share
+    return task.set_point + 2 * draws, task.input_low + (task.input_high - task.input_low) * share
 
 
 def test_file_and_torch_agree_over_whole_episodes(deployed):

@@ -69,7 +69,8 @@ def test_the_switch_from_manual_does_not_jump_and_the_offset_fades(description):
 
 def test_bounds_and_rates_hold_whatever_the_policy_asks(description):
     slow = [variable.model_copy(update={"rate": 0.25}) for variable in description.manipulated]
-    guard, measured = Guard(Asking([100.0, -100.0]), description.model_copy(update={"manipulated": tuple(slow)}), LIMITS), Measured()
+    description = description.model_copy(update={"manipulated": tuple(slow)})
+    guard, measured = Guard(Asking([100.0, -100.0]), description, LIMITS), Measured()
     inputs = np.array([guard.step(measured(), SET_POINT) for _ in range(60)])
     assert np.abs(np.diff(inputs, axis=0)).max() <= 0.25 + 1e-12
     assert inputs[-1].tolist() == [23.0, 18.0]

@@ -38,7 +38,8 @@ def test_the_whole_chain_runs_for_any_number_of_variables(n_y, n_u, tmp_path, ro
     assert len([row for row in judged.index if row.startswith("movement:")]) == n_u
     assert np.isfinite(judged["online"].drop([row for row in judged.index if row.startswith("rise_time")])).all()
     assert plant_report.export_policy(plant, online, model, task, tmp_path / "policy.onnx") < 1e-5
-    assert [entry["tag"] for entry in DeployedPolicy(tmp_path / "policy.onnx").notes["controlled"]] == [f"Y{i}.PV" for i in range(n_y)]
+    notes = DeployedPolicy(tmp_path / "policy.onnx").notes
+    assert [entry["tag"] for entry in notes["controlled"]] == [f"Y{i}.PV" for i in range(n_y)]
 
 
 def test_the_features_are_those_of_the_record_and_on_y(tmp_path, root):

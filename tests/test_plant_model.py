@@ -3,6 +3,7 @@
 import sys
 import types
 
+import numpy as np
 import pytest
 import torch
 from plants import MadeUpPlant
@@ -53,9 +54,8 @@ def own(monkeypatch):
 
 
 def test_a_step_of_the_linear_model_is_its_equation():
-    model = LinearModel(
-        *(torch.tensor(values) for values in ([[0.5, 0.1], [0.0, 1.0]], [[1.0], [2.0]], [0.1, 0.0], [3.0, 0.0], [4.0, 0.0], [0.3], [0.4]))
-    )
+    matrices = [[0.5, 0.1], [0.0, 1.0]], [[1.0], [2.0]]
+    model = LinearModel(*(torch.tensor(values) for values in (*matrices, [0.1, 0.0], [3.0, 0.0], [4.0, 0.0], [0.3], [0.4])))
     x, u, noise = torch.tensor([[1.0, 2.0]]), torch.tensor([[10.0]]), torch.tensor([[1.0, 1.0]])
     assert model.step(x, u, noise)[0].tolist() == pytest.approx([0.5 + 0.2 + 10 + 0.1 + 5.0, 22.0])
     assert model.observe(x, torch.ones(1, 1)).tolist() == [[pytest.approx(1.5)]]
@@ -92,7 +92,6 @@ def test_what_cannot_be_imported_is_refused(description):
 
 def test_a_gymnasium_environment_runs_in_engineering_units(description):
     gymnasium = pytest.importorskip("gymnasium")
-    import numpy as np
 
     class Environment(gymnasium.Env):
         observation_space = gymnasium.spaces.Box(0.0, 100.0, (1,), np.float64)
@@ -110,7 +109,8 @@ def test_a_gymnasium_environment_runs_in_engineering_units(description):
     gymnasium.register("Made/Up-v0", entry_point=Environment, disable_env_checker=True)
     plant = load_plant("gymnasium:Made/Up-v0", description)
     task = description.task(torch.zeros(1), torch.zeros(1), torch.float64)
-    first, second = (rollout(plant, Hold(torch.tensor([1.0, 2.0]).double()), task, 4, torch.Generator().manual_seed(0)) for _ in "ab")
+    held = Hold(torch.tensor([1.0, 2.0], dtype=torch.float64))
+    first, second = (rollout(plant, held, task, 4, torch.Generator().manual_seed(0)) for _ in range(2))
     assert first.y[0].std() > 0.1
     assert torch.equal(first.y, second.y)
     # The inputs rest at 20 and 21; with deviations of 1 and 2 the output rises by 0.3 a sample.

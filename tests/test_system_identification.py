@@ -1,4 +1,4 @@
-"""A model identified from records under feedback: it finds the truth, its likelihood rises, and it says when data cannot carry it."""
+"""A model identified from records under feedback: the truth is found, the likelihood rises, and poor data are named."""
 
 import numpy as np
 import pytest

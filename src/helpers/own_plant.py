@@ -3,6 +3,7 @@
 The learning is that of the paper's plant; what differs is that a plant shows y alone, so that the features are on y.
 """
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -218,6 +219,42 @@ def judge(plant: OwnPlant, task: ControlTask, batches: Mapping[str, Trajectories
         kept = {key: value for key, value in rows.items() if not key.endswith(":std") and key not in ("objective_x", "objective_y")}
         columns[name] = kept | {"feature gap": gap}
     return pd.DataFrame(columns)
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Policy and weights carried to other set points: the plant with that task, the policy after each step, and the task."""
+
+    plant: OwnPlant
+    offline: Apprenticeship
+    online: LSTMPolicy
+    task: ControlTask
+
+
+def transfer(
+    plant: OwnPlant, learned: Apprenticeship, model: LinearModel, process: Process, set_points: Mapping[str, float]
+) -> Transfer:
+    """Section 5.3 on records: offline on the demonstrations of other set points, online on what stands for the plant.
+
+    Args:
+        set_points: in engineering units, by name of the controlled variable.
+    """
+    other = plant.with_set_points(set_points)
+    start = copy.deepcopy(learned.policy), learned.weights
+    offline = learn_offline(other, model, task_on(other, model), start)
+    task = task_at_rest(other, process)
+    online, _ = improve_on(other, copy.deepcopy(offline.policy), process, task)
+    return Transfer(other, offline, online, task)
+
+
+def parameter_table(plant: OwnPlant, identified: Identified) -> pd.DataFrame:
+    """A, B and c of the identified model with their standard errors, scaled; a row for each output."""
+    before = [*(f"A {name}" for name in plant.controlled), *(f"B {name}" for name in plant.manipulated)]
+    lagged = [f"{name} at lag {lag}" for kind in "AB" for lag in range(identified.lags) for name in before if name.startswith(kind)]
+    columns = [*(before if identified.lags == 1 else lagged), "c"]
+    values = pd.DataFrame(identified.parameters, index=plant.controlled, columns=columns)
+    errors = pd.DataFrame(identified.errors, index=plant.controlled, columns=columns)
+    return pd.concat({"value": values.T, "standard error": errors.T}, axis=1)
 
 
 def history(records: Sequence[Any], names: Sequence[str], report: Callable[[Any], dict[str, Any]] = vars) -> pd.DataFrame:

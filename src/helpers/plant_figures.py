@@ -1,7 +1,5 @@
 """What the path from a historian file to a controller shows: data quality, the model on held-out records, the responses."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
@@ -18,6 +16,7 @@ from helpers.tables import symbol
 
 MEASURED, SIMULATED = COLOURS["controlled", "expert"], COLOURS["controlled", "agent"]
 LEFT_OUT, BY_HAND = "#d9d9d9", "#fde0b5"
+MODE_COLOURS = {"manual": BY_HAND, "hold": LEFT_OUT, "PID": "#d5ecd4"}
 MOST_POINTS = 4000  # of a line: more cannot be told apart on a page
 
 
@@ -83,9 +82,9 @@ def validation_figure(validation: Validation, description: PlantDescription, win
             color=LEFT_OUT,
             label="95 % of white noise",
         )
-        right.vlines(np.arange(1, len(values) + 1), 0, values, color=INK, linewidth=2)
-        right.plot(np.arange(1, len(values) + 1), values, "o", color=INK, markersize=3, label="autocorrelation")
-        right.axhline(0, color=MUTED, linewidth=0.8)
+        lags = np.arange(1, len(values) + 1)
+        right.bar(lags, values, width=0.2, color=INK)
+        right.plot(lags, values, "o", color=INK, markersize=3, label="autocorrelation")
         right.set_title(f"{symbol(variable.name)}: residuals, Ljung-Box p = {validation.p_value[index]:.2g}", loc="left")
         right.set_ylabel("autocorrelation")
         right.xaxis.set_major_locator(MaxNLocator(6, integer=True))
@@ -98,9 +97,9 @@ def validation_figure(validation: Validation, description: PlantDescription, win
     return figure
 
 
-def with_units(figure: Figure, units: Sequence[tuple[str, str]]) -> Figure:
-    """A figure of responses with the units of this plant: `units` by name of the variable, whose panels carry it as label."""
-    words = dict(units)
+def with_units(figure: Figure, description: PlantDescription) -> Figure:
+    """A figure of responses with the units of this plant; its panels carry the name of their variable as label."""
+    words = {variable.name: variable.unit for variable in (*description.controlled, *description.manipulated)}
     for axis in figure.axes:
         names = [name for name in str(axis.get_label()).split() if name in words]
         if names:
@@ -113,3 +112,37 @@ def quality_counts(clean: CleanRecords) -> pd.DataFrame:
     """How many rows each check found, a row a check and a column a column of the file."""
     section = clean.section()
     return section.pivot_table(index="check", columns="column", values="count", aggfunc="sum", sort=False).fillna(0).astype(int)
+
+
+def guard_figure(steps: pd.DataFrame, description: PlantDescription) -> Figure:
+    """A guarded policy sample by sample, a panel for each variable; engineering units. The shade says who sets the inputs.
+
+    Args:
+        steps: a row a sample; columns mode, a name for each variable, and `<name>_sp` for the set points.
+    """
+    variables: list[Variable] = [*description.controlled, *description.manipulated]
+    figure = empty_figure(WIDTH, 1.6 * len(variables) + 0.7)
+    axes = figure.subplots(len(variables), 1, sharex=True, squeeze=False)[:, 0]
+    sample = steps.index.to_numpy()
+    for axis, variable in zip(axes, variables, strict=True):
+        controlled = variable in description.controlled
+        colour = COLOURS["controlled" if controlled else "manipulated", "agent"]
+        style = "default" if controlled else "steps-post"
+        axis.plot(sample, steps[variable.name], color=colour, drawstyle=style, label=variable.name)
+        if controlled:
+            axis.plot(sample, steps[f"{variable.name}_sp"], color=SET_POINT, linestyle=LINE_STYLES["set point"], label="set point")
+        low, high = axis.get_ylim()
+        for mode, shade in MODE_COLOURS.items():
+            here = steps["mode"].eq(mode)
+            where = (here | here.shift(fill_value=False)).to_numpy()
+            axis.fill_between(sample, low, high, where=where, color=shade, linewidth=0, zorder=0, step="post", label=mode)
+        axis.set_ylim(low, high)
+        words = variable.description or variable.name
+        axis.set_title(f"{words[:1].upper()}{words[1:]} ({variable.name})", loc="left")
+        axis.set_ylabel(variable.unit)
+        axis.set_label(variable.name)
+    axes[-1].set_xlabel("sample")
+    axes[-1].set_xlim(sample[0], sample[-1])
+    handles = [Patch(color=shade, label=mode) for mode, shade in MODE_COLOURS.items()]
+    figure.legend(handles=[*handles, axes[0].lines[1]], loc="outside lower center", ncols=len(handles) + 1, frameon=False)
+    return figure

@@ -66,6 +66,7 @@ def export_policy(plant: OwnPlant, policy: LSTMPolicy, process: Process, task: C
     Raises:
         InputError: if file and policy disagree.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     steady = plant.description.steady("controlled"), plant.description.steady("manipulated")
     export(policy, task, *steady, path, notes(plant))
     batch = compare(plant, process, task, {"policy": policy})["policy"]
@@ -101,7 +102,6 @@ def run(path: Path, output: Path, params_root: Path, scale: str, seed: int) -> O
     recorded = judge(plant, plant_task, {"record": found.trajectories, **batches})
     gap = feature_gap(features.trajectory(batches["offline"]).mean(0), features.trajectory(found.trajectories).mean(0))
     sentences.append(f"feature gap between the offline policy and the record: {100 * gap:.1f} %")
-    output.mkdir(parents=True, exist_ok=True)
     worst = export_policy(plant, online, process, plant_task, output / "policy.onnx")
     sentences.append(f"policy.onnx agrees with the learned policy to {worst:.1g} of the input range over whole episodes")
     fit = pd.DataFrame({"fit": validation.fit, "Ljung-Box p": validation.p_value}, index=list(plant.controlled))

@@ -18,6 +18,7 @@ from helpers.nonlinear_tank import HistoryParams, NonlinearTank, load_tank
 from helpers.params import GainParams, Params, load
 from helpers.randomness import stream
 from helpers.sources import PROJECT
+from helpers.task import ControlTask
 
 FILE = PROJECT / "notebooks/plant/tank.csv"
 LOOPS = ("AC101", "TC101")  # the tags of the loops: .PV what is measured, .SP the set point, .OP the input
@@ -28,6 +29,11 @@ AUTOMATIC, MANUAL, BAD = "AUTO", "MAN", "Bad"
 def pi_gains(gains: GainParams) -> GainParams:
     """The same gains without the derivative part."""
     return gains.model_copy(update={"derivative": (0.0,) * len(gains.proportional)})
+
+
+def pi_controller(params: Params, task: ControlTask) -> PID:
+    """The PI that wrote the file, for a task of the tank."""
+    return PID(pi_gains(params.demonstrator), task.set_point, params.process.sampling_time)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ BIN := $(VENV)/bin
 export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
-export MPLBACKEND := agg
 SNAKEMAKE = $(BIN)/python -m snakemake --profile profiles/local --cores $(CORES)
 
 .PHONY: help setup reports evidence smoke test lab bench publish notebooks clean

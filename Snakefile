@@ -1,20 +1,30 @@
 # The order of the stages for each case and seed. Every stage is one notebook, executed by helpers.run.
-# Settings (snakemake --config name=value): seeds (how many), scale (smoke or paper), results, reports (folders), and
-# evidence=1 for the runs beyond the paper's own: the claims, the trials of offline learning and the inferred settings.
+# Settings (snakemake --config name=value): seeds (how many), scale (smoke or paper), results, reports (folders),
+# evidence=1 for the runs beyond the paper's own (the claims, the trials of offline learning and the inferred settings), and
+# missing=1 for a report of the seeds whose stages are all there.
+#
+# A result says in its record.json what it was made from. Where that is otherwise now, the file CHANGED is among the inputs of
+# its rule, and newer than the result; so what is run again does not depend on the times of files that git or an editor touched.
+import json
 import shlex
 import sys
+import time
+from collections import Counter
+from functools import cache
 from pathlib import Path
 
+from helpers.identity import changes, inputs
 from helpers.params import load_trials
-from helpers.sources import PROJECT, modules_behind, notebook_path
 
 ROOT = Path(workflow.basedir)
 SCALE = config.get("scale", "paper")
 SEEDS = range(int(config.get("seeds", 1)))
 EVIDENCE = bool(int(config.get("evidence", 0)))
+MISSING = bool(int(config.get("missing", 0)))
 RESULTS = config.get("results", "results")
 REPORTS = config.get("reports", "reports/latest")
-VARIANTS = ["improved", "printed"]
+HEADLINE = "improved"
+VARIANTS = [HEADLINE, "printed"]
 TRIALS = sorted(load_trials(ROOT / "params"))
 TRIAL_SEEDS = SEEDS[:5]
 CASES = [1, 2, 3]
@@ -24,19 +34,58 @@ RUN = f"{shlex.quote(sys.executable)} -m helpers.run"
 FOLDER = shlex.quote(str(Path(RESULTS).resolve()))
 ROOTS = f"-p scale {SCALE} -p input_root {FOLDER} -p output_root {FOLDER}"
 
-PARAMS = [str(ROOT / "params" / f"{name}.yaml") for name in ("process", "demonstrators", "features", "learning")]
+CHANGED = f"{RESULTS}/{SCALE}/.changed"
+AGAIN = {}  # the results to be made again, and what they were made from that has changed
 
 
-def sources(notebook, *params):
-    """What a result depends on beside earlier stages: its notebook, its parameter files and the modules behind it."""
-    code = [str(ROOT / path.relative_to(PROJECT)) for path in (notebook_path(notebook), *modules_behind(notebook))]
+@cache
+def present(notebook, case, variant):
+    """What a result would be made from now."""
+    return inputs(notebook, ROOT / "params", SCALE, case, variant, ROOT)
 
-    def inputs(wildcards):
-        case, variant = getattr(wildcards, "case", 3), getattr(wildcards, "variant", "")
-        named = [*params, f"case_{case}", *(["trials"] if variant in TRIALS else [])]
-        return [*code, *PARAMS, *(str(ROOT / f"params/{name}.yaml") for name in named)]
 
-    return inputs
+def made_from(notebook, record):
+    """An input function: the file CHANGED where the result with this record was made from something else than there is now."""
+
+    def changed(wildcards):
+        path = Path(record.format(**dict(wildcards.items())))
+        case, variant = getattr(wildcards, "case", None), getattr(wildcards, "variant", "improved")
+        case = int(case) if case else 3 if "/case_3/" in record else None
+        try:
+            before = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return []
+        except ValueError:
+            before = {}  # damaged: made again
+        if found := changes(before, present(notebook, case, variant)):
+            if not AGAIN:
+                Path(CHANGED).parent.mkdir(parents=True, exist_ok=True)
+                Path(CHANGED).write_text(f"{time.time_ns()}\n", encoding="utf-8")
+            AGAIN[str(path)] = (notebook, ", ".join(found[:3]) + (f" and {len(found) - 3} more" if len(found) > 3 else ""))
+        return [CHANGED] if found else []
+
+    return changed
+
+
+def failures():
+    """What every stage that failed said, by the place of its executed copy."""
+    folders = [Path(RESULTS) / SCALE / f"seed_{seed}" for seed in SEEDS]
+    paths = [path for folder in folders for path in sorted(folder.glob("**/notebooks/*.failed"))]
+    return {str(path): path.read_text(encoding="utf-8").strip() for path in [*paths, *Path(REPORTS).glob("notebooks/*.failed")]}
+
+
+onstart:
+    for (notebook, why), number in Counter(AGAIN.values()).items():
+        print(f"again: {notebook}, {number} result(s); changed: {why}", file=sys.stderr)
+
+
+onerror:
+    found = failures()
+    print(f"\n{len(found)} stage(s) failed; the others are finished and are not run again:", file=sys.stderr)
+    for sentence in found.values():
+        print(f"  {sentence}", file=sys.stderr)
+    if found:
+        print("A report of the seeds that are whole: the same command with missing=1 (make reports MISSING=1).", file=sys.stderr)
 
 
 wildcard_constraints:
@@ -56,7 +105,7 @@ rule all:
 
 rule demonstrations:
     input:
-        sources("01_demonstrations"),
+        made_from("01_demonstrations", f"{CASE}/demonstrations/record.json"),
     output:
         f"{CASE}/demonstrations/record.json",
     log:
@@ -67,7 +116,7 @@ rule demonstrations:
 
 rule offline:
     input:
-        sources("02_offline_irl"),
+        made_from("02_offline_irl", f"{CASE}/offline_{{variant}}/record.json"),
         demonstrations=f"{CASE}/demonstrations/record.json",
     output:
         f"{CASE}/offline_{{variant}}/record.json",
@@ -79,7 +128,7 @@ rule offline:
 
 rule online:
     input:
-        sources("03_online_improvement"),
+        made_from("03_online_improvement", f"{CASE}/online_{{variant}}/record.json"),
         demonstrations=f"{CASE}/demonstrations/record.json",
         offline=f"{CASE}/offline_{{variant}}/record.json",
     output:
@@ -94,21 +143,31 @@ rule online:
 
 rule transfer:
     input:
-        sources("04_knowledge_transfer"),
+        made_from("04_knowledge_transfer", f"{RESULTS}/{SCALE}/seed_{{seed}}/case_3/online_{{variant}}/record.json"),
         demonstrations=f"{RESULTS}/{SCALE}/seed_{{seed}}/case_3/demonstrations/record.json",
         source=f"{RESULTS}/{SCALE}/seed_{{seed}}/case_1/offline_{{variant}}/record.json",
     output:
         f"{RESULTS}/{SCALE}/seed_{{seed}}/case_3/transfer_{{variant}}/record.json",
         f"{RESULTS}/{SCALE}/seed_{{seed}}/case_3/online_{{variant}}/record.json",
+    wildcard_constraints:
+        variant=HEADLINE,
     log:
         f"{RESULTS}/{SCALE}/seed_{{seed}}/case_3/notebooks/04_knowledge_transfer_{{variant}}.ipynb",
     shell:
         f"{RUN} 04_knowledge_transfer {{log:q}} -p case 3 -p seed {{wildcards.seed}} -p variant {{wildcards.variant}} {ROOTS}"
 
 
+# Nothing reads what other variants would learn online, so helpers.run ends notebook 04 after the transfer.
+use rule transfer as transfer_alone with:
+    output:
+        f"{RESULTS}/{SCALE}/seed_{{seed}}/case_3/transfer_{{variant}}/record.json",
+    wildcard_constraints:
+        variant="|".join([*VARIANTS[1:], *TRIALS]),
+
+
 rule inferred_settings:
     input:
-        sources("00_inferred_settings", "identification", "published", *(f"case_{case}" for case in CASES)),
+        made_from("00_inferred_settings", f"{RESULTS}/{SCALE}/seed_0/inferred_settings/record.json"),
     output:
         f"{RESULTS}/{SCALE}/seed_0/inferred_settings/record.json",
     log:
@@ -119,7 +178,7 @@ rule inferred_settings:
 
 rule claims:
     input:
-        sources("08_claims", "experiments"),
+        made_from("08_claims", f"{CASE}/experiments/record.json"),
         demonstrations=f"{CASE}/demonstrations/record.json",
         offline=f"{CASE}/offline_improved/record.json",
         transfer=lambda wildcards: [f"{CASE}/transfer_improved/record.json"] if wildcards.case == "3" else [],
@@ -146,22 +205,26 @@ def evidence():
     return stages
 
 
+def of_seed(seed):
+    """Every result of a seed that the report reads, whatever was asked for."""
+    folder = f"{RESULTS}/{SCALE}/seed_{seed}"
+    stages = [f"{folder}/case_{case}/demonstrations/record.json" for case in CASES]
+    stages += [f"{folder}/case_{case}/offline_{variant}/record.json" for case in (1, 2) for variant in VARIANTS]
+    stages += [f"{folder}/case_3/offline_improved/record.json"]
+    stages += [f"{folder}/case_3/transfer_{variant}/record.json" for variant in VARIANTS]
+    stages += [f"{folder}/case_{case}/online_improved/record.json" for case in CASES]
+    return stages
+
+
 def finished(wildcards):
-    """Every result that the report reads, for every seed."""
-    stages = []
-    for seed in SEEDS:
-        folder = f"{RESULTS}/{SCALE}/seed_{seed}"
-        stages += [f"{folder}/case_{case}/demonstrations/record.json" for case in CASES]
-        stages += [f"{folder}/case_{case}/offline_{variant}/record.json" for case in (1, 2) for variant in VARIANTS]
-        stages += [f"{folder}/case_3/offline_improved/record.json"]
-        stages += [f"{folder}/case_3/transfer_{variant}/record.json" for variant in VARIANTS]
-        stages += [f"{folder}/case_{case}/online_improved/record.json" for case in CASES]
-    return stages + (evidence() if EVIDENCE else [])
+    """Every result that the report reads; those that are there, if some may be missing."""
+    stages = [stage for seed in SEEDS for stage in of_seed(seed)] + (evidence() if EVIDENCE else [])
+    return [stage for stage in stages if Path(stage).is_file()] if MISSING else stages
 
 
 rule report:
     input:
-        sources("05_report", "published", "claims", "trials"),
+        made_from("05_report", f"{REPORTS}/provenance.json"),
         template=[str(path) for path in sorted((ROOT / "reports/template").iterdir())],
         stages=finished,
     output:
@@ -172,5 +235,5 @@ rule report:
     params:
         seeds=len(SEEDS),
     shell:
-        f"{RUN} 05_report {{log:q}} -p seeds {{params.seeds}} -p scale {SCALE} -p input_root {FOLDER}"
+        f"{RUN} 05_report {{log:q}} -p seeds {{params.seeds}} -p missing {int(MISSING)} -p scale {SCALE} -p input_root {FOLDER}"
         f" -p output_root {shlex.quote(str(Path(REPORTS).resolve()))}"

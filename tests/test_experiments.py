@@ -115,6 +115,18 @@ def test_where_no_reward_can_be_found_the_policy_stays_as_it_was(prepared):
     assert torch.equal(before, after)  # the start itself was not trained
 
 
+def test_the_online_run_of_notebook_03_is_taken_over_and_would_come_out_the_same(root):
+    run = prepare(open_session("08_claims", {"case": 1, "seed": 0, "scale": "smoke", "params_root": str(root), **STREAMS}))
+    betas = run.session.params.case.online.beta
+    policy, curve = experiments.from_imitator(run, list(betas))
+    assert policy is run.improved
+    repeated, again = attempt(run.session, run.imitator, betas)
+    assert curve[again.columns.tolist()].to_numpy() == pytest.approx(again.to_numpy(), rel=1e-6)
+    taken, judged = (stages.judge(run.session, experiments.mode(run.session, one))["objective"] for one in (policy, repeated))
+    assert taken == pytest.approx(judged, rel=1e-6)
+    assert experiments.from_imitator(run, [beta / 2 for beta in betas])[0] is not run.improved
+
+
 def test_a_policy_learned_under_weights_follows_them(prepared):
     """With one weight alone, on closeness of the first loop, that feature grows and others may not."""
     session = replace(

@@ -98,7 +98,7 @@ def test_fast_stepping_agrees_with_forward_along_whole_trajectories(study, dtype
         command[t], memory = controller.act(batch.y[t], memory)
         u[t] = command[t].clamp(case.task.input_low, case.task.input_high)
     mean, std = (part.detach() for part in policy(batch.y, u, case.task))
-    expected = mean + std * memory.exploration if exploring else mean
+    expected = mean + std * torch.stack(memory.exploration).mT if exploring else mean
     span = case.task.input_high - case.task.input_low
     assert ((command - expected) / span).abs().max() < tolerance
 

@@ -124,7 +124,7 @@ class Grid(PolicyController):
 
     def start(self, n_trajectories, n_steps, generator):
         memory = super().start(n_trajectories, n_steps, generator)
-        memory.exploration = self.nodes
+        memory.exploration = self.nodes.mT.unbind(0)
         return memory
 
 

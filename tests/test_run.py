@@ -31,6 +31,7 @@ def here(monkeypatch, tmp_path):
     """A working directory that is not the project's, in which `run.main` may not leave its setting behind."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TQDM_DISABLE", "1")
+    monkeypatch.setenv("MPLBACKEND", "agg")
     return tmp_path
 
 
@@ -202,7 +203,7 @@ def finished(plan):
     return plan
 
 
-ONE_SEED = {"demonstrations": 3, "offline": 5, "online": 2, "transfer": 2, "report": 1}
+ONE_SEED = {"demonstrations": 3, "offline": 5, "online": 2, "transfer": 1, "transfer_alone": 1, "report": 1}
 STAGE = "results/smoke/seed_0/case_{}/{}/record.json"
 
 
@@ -217,9 +218,10 @@ def test_the_whole_run_is_fourteen_jobs_with_all_and_each_seed_repeats_its_stage
     [
         (STAGE.format(2, "demonstrations"), {"demonstrations": 1}),
         (STAGE.format(2, "online_improved"), {"demonstrations": 1, "offline": 1, "online": 1}),
-        (STAGE.format(3, "online_printed"), {"demonstrations": 2, "offline": 1, "transfer": 1}),
+        (STAGE.format(3, "online_improved"), {"demonstrations": 2, "offline": 1, "transfer": 1}),
+        (STAGE.format(3, "transfer_printed"), {"demonstrations": 2, "offline": 1, "transfer_alone": 1}),
     ],
-    ids=["recording", "online", "transfer"],
+    ids=["recording", "online", "transfer", "transfer alone"],
 )
 def test_a_stage_asked_for_alone_runs_only_what_it_needs(plan, target, jobs):
     assert plan(target) == jobs
@@ -237,7 +239,7 @@ def test_finished_stages_are_skipped(finished):
     [
         ("params/case_2.yaml", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
         ("params/published.yaml", {"report": 1}),
-        ("notebooks/04_knowledge_transfer.ipynb", {"transfer": 2, "report": 1}),
+        ("notebooks/04_knowledge_transfer.ipynb", {"transfer": 1, "transfer_alone": 1, "report": 1}),
         ("src/helpers/maxent_irl.py", ONE_SEED),
         ("src/helpers/report.py", {"report": 1}),
         ("reports/template/report.md.jinja", {"report": 1}),

@@ -2,13 +2,10 @@
 
 import hashlib
 import json
-import os
 import shutil
 import subprocess
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +16,14 @@ from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
+from helpers.identity import digest
 from helpers.params import InputError, LearningParams
 from helpers.policy import LSTMPolicy
+from helpers.scratch import beside, sweep
 from helpers.task import ControlTask
 from helpers.trajectories import Trajectories
 
 RECORD = "record.json"
-PACKAGES = ("torch", "numpy", "pandas", "matplotlib", "seaborn", "papermill", "snakemake")
 FLOATS = "%.17g"  # enough digits to read back the very same number
 
 
@@ -39,6 +37,11 @@ class Stage:
 
     folder: Path
     record: dict[str, Any]
+
+    @property
+    def content(self) -> str:
+        """A hash of all files of the stage, without its record."""
+        return digest(self.record["files"])
 
     def path(self, name: str) -> Path:
         """The path of one of the stage's files."""
@@ -87,15 +90,21 @@ def save_stage(
 ) -> Stage:
     """Write a stage's results into `folder`, all of them or none, and return what was written.
 
-    Everything goes into a folder beside it first, which then takes the place of an older one. The record gains the
-    hash of each file.
+    Everything is written beside it first; then each file takes the place of an older one, the record last, which gains the
+    hash of each file. Whoever reads meanwhile, or after a kill in between, finds the older results, the new ones, or a record
+    that does not fit its files, which `load_stage` refuses. Two processes that write the same results do not disturb each
+    other: the notebook of a killed run may live on beside the resumed one.
 
     Args:
         tables: file names ending in .csv and their tables; `figures`: names without ending, written as SVG and PNG.
     """
     folder = folder.resolve()
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}")
+    for name in (*(tables or {}), *(figures or {}), *(texts or {})):
+        if Path(name).name != name:
+            raise ArtifactError(f"{folder}: the file name '{name}' leads out of the stage's folder")
+    partial = beside(folder)
     try:
+        sweep(folder)
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         for name, frame in (tables or {}).items():
@@ -110,8 +119,12 @@ def save_stage(
         files = {path.name: _hash(path) for path in sorted(partial.iterdir())}
         sealed = json.dumps({**record, "files": files}, indent=1, sort_keys=True)
         (partial / RECORD).write_text(sealed + "\n", encoding="utf-8")
-        shutil.rmtree(folder, ignore_errors=True)
-        partial.rename(folder)
+        folder.mkdir(exist_ok=True)
+        for name in (*files, RECORD):
+            (partial / name).replace(folder / name)
+        for path in folder.iterdir():
+            if path.name not in (*files, RECORD):
+                path.unlink()
     except OSError as error:
         raise ArtifactError(f"{folder}: the results could not be written: {error.strerror}") from error
     finally:
@@ -213,8 +226,3 @@ def code_revision(root: Path) -> str:
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
     return commit + ("+changes" if changed else "")
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that shape the results."""
-    return {"python": sys.version.split()[0], **{name: metadata.version(name) for name in PACKAGES}}

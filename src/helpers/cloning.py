@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from helpers.optimiser import Adam
 from helpers.params import CloningParams
 from helpers.policy import LSTMPolicy
 from helpers.reinforce import TrainingError, annealed
@@ -56,7 +57,7 @@ def clone(
         raise TrainingError(f"cloning needs two demonstrations or more, one of them to validate on, found {n_all}")
     n_held = max(1, round(params.validation * n_all))
     held, used = torch.arange(n_all - n_held, n_all), n_all - n_held
-    optimiser = torch.optim.Adam(policy.parameters(), lr=params.learning_rate_start)
+    optimiser = Adam(policy.parameters(), lr=params.learning_rate_start)
     best = Cloning(policy, 0, float("inf"))
     for step in range(1, n_steps + 1):
         for group in optimiser.param_groups:

@@ -1,9 +1,10 @@
 """Algorithm 2: maximum-entropy inverse reinforcement learning of the reward weights, with Algorithm 1 inside."""
 
 import copy
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,7 +13,7 @@ from helpers.evaluation import expected_features, feature_gap, relative_gap
 from helpers.features import FeatureMap, linear_reward
 from helpers.params import WeightParams
 from helpers.policy import LSTMPolicy, PolicyController
-from helpers.reinforce import Learner, TrainingError, reinforce
+from helpers.reinforce import EpochRecord, Learner, Memory, NoMemory, TrainingError, reinforce
 from helpers.trajectories import Trajectories
 
 
@@ -57,6 +58,14 @@ class WeightAscent:
         self.raw = raw.clamp(-params.bound, params.bound)
         self.weights = project(self.raw)
         self.mean = params.averaging * self.mean + (1 - params.averaging) * self.weights
+
+    def state(self) -> dict[str, Tensor]:
+        """What the next steps depend on; see `restore`."""
+        return {"raw": self.raw, "weights": self.weights, "mean": self.mean}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Go on from the state of another ascent with the same parameters."""
+        self.raw, self.weights, self.mean = state["raw"], state["weights"], state["mean"]
 
     @property
     def result(self) -> Tensor:
@@ -105,6 +114,7 @@ def maxent_irl(
     n_iterations: int,
     n_measured: int,
     report: Callable[[IterationRecord], None] = lambda record: None,
+    memory: Memory | None = None,
 ) -> Apprenticeship:
     """Algorithm 2: policy optimisation, Monte Carlo evaluation, gradient, ascent; `n_iterations` times.
 
@@ -117,6 +127,7 @@ def maxent_irl(
         start: alpha before the first iteration, shape (d,).
         n_measured: episodes of the deployed policy (its mode) that estimate E[v_pi] in each iteration.
         report: called with the record of each iteration as it ends.
+        memory: where the training keeps its state; with one it goes on where an interrupted run was.
 
     Raises:
         TrainingError: if the return, the gradient or the features are not finite.
@@ -125,12 +136,40 @@ def maxent_irl(
     ascent = WeightAscent(params, start, expert_features)
     smoothed = torch.zeros_like(expert_features)
     records: list[IterationRecord] = []
-    nearest, best_gap, chosen = learner.average, float("inf"), 0
-    for iteration in range(1, n_iterations + 1):
+    nearest, best_gap, chosen = copy.deepcopy(learner.average), float("inf"), 0
+    memory = memory or NoMemory()
+    started: list[EpochRecord] = []  # epochs of an interrupted iteration
+    first = 1
+    if (state := memory.recall()) is not None:
+        learner.restore(state["learner"])
+        ascent.restore(state["ascent"])
+        nearest.load_state_dict(state["nearest"])
+        smoothed, best_gap, chosen, first = (state[name] for name in ("smoothed", "best_gap", "chosen", "iteration"))
+        records = [IterationRecord(**row | {"weights": tuple(row["weights"])}) for row in state["records"]]
+        started = [EpochRecord(**row) for row in state["started"]]
+
+    def state_of(iteration: int, epochs: Sequence[EpochRecord]) -> dict[str, Any]:
+        return {
+            "learner": learner.state(),
+            "ascent": ascent.state(),
+            "nearest": nearest.state_dict(),
+            "smoothed": smoothed,
+            "best_gap": best_gap,
+            "chosen": chosen,
+            "iteration": iteration,
+            "records": [asdict(record) for record in records],
+            "started": [asdict(record) for record in epochs],
+        }
+
+    def keep(iteration: int, epochs: Sequence[EpochRecord]) -> None:
+        memory.keep(partial(state_of, iteration, epochs))
+
+    for iteration in range(first, n_iterations + 1):
         n_epochs = learner.total_epochs * iteration // n_iterations - learner.total_epochs * (iteration - 1) // n_iterations
         alpha = ascent.weights
         reward = partial(apprentice_reward, features=features, weights=alpha)
-        epochs = reinforce(learner, reward, n_epochs, learner.params.patience)
+        epochs = reinforce(learner, reward, n_epochs, learner.params.patience, earlier=started, keep=partial(keep, iteration))
+        started = []
         controller = PolicyController(learner.policy, features.task, exploring=False)
         measured = expected_features(learner.process, controller, features, n_measured, learner.generator)
         learner.episodes += n_measured
@@ -155,4 +194,5 @@ def maxent_irl(
             )
         )
         report(records[-1])
+    memory.keep(partial(state_of, n_iterations + 1, []), finished=True)
     return Apprenticeship(ascent.result, nearest, chosen, tuple(records))

@@ -4,12 +4,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from scipy.sparse.linalg import LinearOperator, cg
 from torch import Tensor
 from torch.nn import functional
 from torch.nn.utils import parameters_to_vector
 
-from helpers.lstm import Tape, stack, stacked
+from helpers.lstm import Tape, stack, stacked, step
 from helpers.policy import RELU6_TOP, LSTMPolicy
 from helpers.task import ControlTask
 from helpers.trajectories import Trajectories
@@ -26,8 +25,9 @@ class Layer:
         self.n_inputs = inputs.shape[1]
         self.weight = weight
         self.tape = Tape.blank(len(inputs), weight, inputs.shape[-1])
-        for t, x in enumerate(inputs):
-            self.tape.step(t, x, weight)
+        self.tape.inputs.copy_(inputs)
+        for moment in self.tape.moments[: len(inputs)]:
+            step(moment, weight)
         gates = self.tape.gates
         slope = gates * (1 - gates)
         width = len(weight) // 4
@@ -110,6 +110,9 @@ def precondition(policy: LSTMPolicy, batch: Trajectories, task: ControlTask, tru
     By the quadratic model, a step along it changes the policy by a divergence of `trust_region` nats a decision, less what
     damping takes (Schulman et al. 2015, Appendix C). There is no line search.
     """
+    # Every stage that learns imports this module, few take the natural gradient, and scipy's solvers take long to load.
+    from scipy.sparse.linalg import LinearOperator, cg  # noqa: PLC0415
+
     parameters = list(policy.parameters())
     gradient = parameters_to_vector([parameter.grad for parameter in parameters if parameter.grad is not None])
     product = fisher_product(policy, batch.y[:, :EPISODES], batch.u[:, :EPISODES], task)

@@ -5,9 +5,11 @@ unit and range, and `leaves` lists them all for the report. Whatever is wrong wi
 the file, the key and what was expected.
 """
 
+import copy
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -212,6 +214,7 @@ class ScaleParams(Record):
     evaluation: Annotated[Count, Field(gt=1), Leaf("trajectories")]
     expert_evaluation: Annotated[Count, Field(gt=1), Leaf("trajectories")]
     epoch_share: Annotated[Share, Leaf("-")]
+    checkpoint_interval: Annotated[Positive, Leaf("s")]
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -683,7 +686,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise ParameterError(f"{path}: the parameter file is missing")
     try:
-        content = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+        content = copy.deepcopy(_parsed(path.read_text(encoding="utf-8")))
     except DuplicateKeyError as error:
         raise ParameterError(f"{path}: {' '.join(str(error.problem).split())}") from error
     except (YAMLError, UnicodeDecodeError, ValueError) as error:
@@ -694,6 +697,11 @@ def read_yaml(path: Path) -> dict[str, Any]:
         if not isinstance(key, str):
             raise ParameterError(f"{path}: key '{key}': expected a word")
     return content
+
+
+@cache
+def _parsed(text: str) -> Any:
+    return YAML(typ="safe", pure=True).load(text)
 
 
 def validate(kind: type[R], content: Any, path: Path, prefix: str = "") -> R:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from helpers.lstm import Tape, Unroll, stacked
+from helpers.lstm import Tape, Unroll, stacked, step
 from helpers.params import ExplorationParams, PolicyParams
 from helpers.task import ControlTask
 
@@ -32,6 +32,10 @@ class Scaling:
     def inputs(self, y: Tensor, u_previous: Tensor) -> Tensor:
         """What the network sees, shape (..., n_y + n_u)."""
         return (torch.cat([y, u_previous], dim=-1) - self.centre) * self.gain
+
+    def features_first(self) -> "Scaling":
+        """The same for arrays whose trajectories come last: each of shape (n, 1)."""
+        return Scaling(self.centre[:, None], self.gain[:, None], self.shift[:, None], self.factor[:, None])
 
     def outputs(self, output: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation, each (..., n_u), from the output layer before its activation."""
@@ -132,31 +136,46 @@ class LSTMPolicy(nn.Module):
             signal = functional.leaky_relu(layer(signal)[0], self.params.leaky_slope)
         return self.scale(self.output(signal), task)
 
-    def unrolled(self, y: Tensor, u: Tensor, task: ControlTask, tapes: list[Tape] | None = None) -> tuple[Tensor, Tensor]:
-        """What `forward` gives, faster; with the tapes that a controller with these parameters recorded, faster still."""
-        previous = torch.cat([torch.zeros_like(u[:1]), u[:-1]])
-        signal = self.network_inputs(y[: len(u)], previous, task).mT
-        for index, layer in enumerate(self.lstms):
-            hidden = Unroll.apply(signal, stacked(layer), tapes[index] if tapes else None)
-            signal = functional.leaky_relu(hidden, self.params.leaky_slope)
-        return self.scale((self.output.weight @ signal + self.output.bias[:, None]).mT, task)
+    def unrolled(
+        self, y: Tensor, u: Tensor, task: ControlTask, tapes: Sequence[Tape] = (), recorded: bool = False
+    ) -> tuple[Tensor, Tensor]:
+        """What `forward` gives, faster.
 
-    def log_probability(self, y: Tensor, u: Tensor, command: Tensor, task: ControlTask, tapes: list[Tape] | None = None) -> Tensor:
+        Tapes of these trajectories lend their memory. With `recorded` they hold what a controller with these parameters computed
+        along the trajectories, and that is not computed again.
+        """
+        weights = [stacked(layer) for layer in self.lstms]
+        if recorded:
+            signal = tapes[0].inputs
+        else:
+            previous = torch.cat([torch.zeros_like(u[:1]), u[:-1]])
+            signal = self.network_inputs(y[: len(u)], previous, task).mT
+            lent: Sequence[Tape | None] = tapes or [None] * len(weights)
+            tapes = [Tape.blank(len(u), weight.detach(), u.shape[1], old) for weight, old in zip(weights, lent, strict=True)]
+        for weight, tape in zip(weights, tapes, strict=True):
+            signal = functional.leaky_relu(Unroll.apply(signal, weight, tape, recorded), self.params.leaky_slope)
+        # A batch of products: `@` would copy the signal of all steps to make one product of them.
+        output = torch.baddbmm(self.output.bias[:, None], self.output.weight.expand(len(signal), -1, -1), signal)
+        return self.scale(output.mT, task)
+
+    def log_probability(self, y: Tensor, u: Tensor, command: Tensor, task: ControlTask) -> Tensor:
         """ln pi(command_t | y_0..y_t, u_0..u_{t-1}), shape (T, K): the term of Eq. 3.2.3.
 
         The probability is that of the command before it was clipped to the bounds, which is what the policy drew.
         """
-        return log_density(command, *self.unrolled(y, u, task, tapes))
+        return log_density(command, *self.unrolled(y, u, task))
 
 
 @dataclass
 class PolicyMemory:
-    """What every layer computed so far, and the exploration noise of every step."""
+    """What every layer computed so far, and the exploration noise of every step; features first."""
 
     step: int
     tapes: list[Tape]
-    u_previous: Tensor  # (K, n_u)
-    exploration: Tensor | None  # (T, K, n_u), standard normal
+    seen: Tensor  # the present observation above the input before it, shape (n_y + n_u, K)
+    observed: Tensor  # the two parts of `seen`
+    applied: Tensor
+    exploration: tuple[Tensor, ...]  # standard normal, (n_u, K) for each step; empty without exploration
 
 
 class PolicyController:
@@ -178,26 +197,33 @@ class PolicyController:
             self.layers = [stacked(layer) for layer in policy.lstms]
             self.output_weight, self.output_bias = policy.output.weight.clone(), policy.output.bias[:, None].clone()
         self.tapes = list(used)
-        self.scaling = policy.scaling(task)
+        self.scaling = policy.scaling(task).features_first()
+        self.low, self.high = task.input_low[:, None], task.input_high[:, None]
 
     def start(self, n_trajectories: int, n_steps: int, generator: torch.Generator) -> PolicyMemory:
         """Zero hidden states, the input at u* = 0, and all exploration noise drawn at once."""
-        like = self.output_weight
-        n_inputs = self.policy.n_manipulated
+        like, n_inputs = self.output_weight, self.policy.n_manipulated
         used: Sequence[Tape | None] = self.tapes or [None] * len(self.layers)
         length = n_steps if self.recording else 1
         tapes = [Tape.blank(length, weight, n_trajectories, old) for weight, old in zip(self.layers, used, strict=True)]
         self.tapes = tapes if self.recording else []
-        noise = torch.randn(n_steps, n_trajectories, n_inputs, generator=generator, dtype=like.dtype) if self.exploring else None
-        return PolicyMemory(0, tapes, like.new_zeros(n_trajectories, n_inputs), noise)
+        shape = (n_steps, n_inputs, n_trajectories)
+        noise = torch.randn(shape, generator=generator, dtype=like.dtype).unbind(0) if self.exploring else ()
+        seen = like.new_zeros(len(self.scaling.centre), n_trajectories)
+        return PolicyMemory(0, tapes, seen, seen[:-n_inputs], seen[-n_inputs:], noise)
 
     def act(self, observation: Tensor, memory: PolicyMemory) -> tuple[Tensor, PolicyMemory]:
         """The policy's command for one sample; the memory is updated in place."""
-        signal = self.scaling.inputs(observation, memory.u_previous).T
-        for tape, weight in zip(memory.tapes, self.layers, strict=True):
-            signal = functional.leaky_relu(tape.step(memory.step, signal, weight), self.policy.params.leaky_slope)
-        mean, std = self.scaling.outputs(torch.addmm(self.output_bias, self.output_weight, signal).T)
-        command = mean if memory.exploration is None else mean + std * memory.exploration[memory.step]
-        memory.u_previous = command.clamp(self.task.input_low, self.task.input_high)
+        memory.observed.copy_(observation.T)
+        moments = [tape.at(memory.step) for tape in memory.tapes]
+        torch.sub(memory.seen, self.scaling.centre, out=moments[0].inputs).mul_(self.scaling.gain)
+        for layer, (moment, weight) in enumerate(zip(moments, self.layers, strict=True)):
+            signal = functional.leaky_relu(step(moment, weight), self.policy.params.leaky_slope)
+            if layer + 1 < len(moments):
+                moments[layer + 1].inputs.copy_(signal)
+        output = torch.addmm(self.output_bias, self.output_weight, signal)
+        mean, std = torch.addcmul(self.scaling.shift, functional.relu6(output), self.scaling.factor).chunk(2)
+        command = torch.addcmul(mean, std, memory.exploration[memory.step]) if memory.exploration else mean
+        torch.clamp(command, self.low, self.high, out=memory.applied)
         memory.step += 1
-        return command, memory
+        return command.T, memory

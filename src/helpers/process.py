@@ -45,7 +45,6 @@ class LinearProcess:
         # One step as two products, so that the rollout does no work twice: x + h dt = (I + A dt) x + (B dt) u.
         self.state_step = torch.eye(self.n_states, dtype=dtype) + self.drift_state * self.sampling_time
         self.input_step = self.drift_input * self.sampling_time
-        self._state_step, self._input_step = self.state_step.T.contiguous(), self.input_step.T.contiguous()
         self._disturbance_step = self.disturbance_gain * self.sampling_time**0.5
 
     def drift(self, x: Tensor, u: Tensor) -> Tensor:
@@ -58,11 +57,11 @@ class LinearProcess:
 
     def step(self, x: Tensor, u: Tensor, noise: Tensor) -> Tensor:
         """The next state by Euler-Maruyama, Eq. 4.1.3a: x + h(x, u) dt + delta(x) sqrt(dt) noise."""
-        return torch.addmm(x * noise * self._disturbance_step, x, self._state_step).addmm_(u, self._input_step)
+        return (x * noise).mul_(self._disturbance_step).addmm_(x, self.state_step.T).addmm_(u, self.input_step.T)
 
     def observe(self, x: Tensor, noise: Tensor) -> Tensor:
         """The observation of Eq. 4.1.4b: each output is read with a relative error."""
-        return x * (1 + self.observation_noise * noise)
+        return torch.addcmul(x, x * noise, self.observation_noise)
 
 
 def linearised_balances(groups: BalanceParams) -> tuple[list[list[float]], list[list[float]]]:

@@ -35,7 +35,8 @@ def check(latest: dict[str, Any], reference: dict[str, Any] | None, revision: st
 
     Raises:
         PublishError: for a run at smoke scale, with uncommitted code, of other code than that checked out, or with fewer
-            seeds than the published one. A stage may be of an earlier commit if no code behind it has changed since.
+            seeds than the published one, or without some of the seeds asked for. A stage may be of an earlier commit: the report
+            has made sure that nothing behind it has changed since.
     """
     if latest["scale"] != "paper":
         raise PublishError(f"reports/latest was run at {latest['scale']} scale; only paper scale is published")
@@ -43,8 +44,8 @@ def check(latest: dict[str, Any], reference: dict[str, Any] | None, revision: st
     if latest["revision"] != revision or not committed:
         found = ", ".join(sorted({latest["revision"], *latest["revisions_of_stages"], revision}))
         raise PublishError(f"run and code must be committed alike, found {found}; commit, run make reports again, then publish")
-    if latest["notebooks_changed_since"]:
-        raise PublishError(f"the code behind {', '.join(latest['notebooks_changed_since'])} has changed; run make reports again")
+    if missing := latest.get("missing_seeds"):
+        raise PublishError(f"the run lacks the seeds {', '.join(map(str, missing))}; run make reports again")
     if reference is not None and len(latest["seeds"]) < len(reference["seeds"]):
         raise PublishError(f"the run has {len(latest['seeds'])} seeds, the published one {len(reference['seeds'])}")
 

@@ -28,7 +28,8 @@ def make_inputs() -> None:
 
 def main() -> int:
     """Refresh inputs and notebooks; returns the exit status."""
-    os.environ |= {"TQDM_DISABLE": "1", "MPLBACKEND": "agg"}  # as the tests run them: no bars, no figure shown by itself
+    os.environ["TQDM_DISABLE"] = "1"
+    os.environ.pop("MPLBACKEND", None)  # the kernel's own, which puts pictures into the notebook
     make_inputs()
     for path in sorted(NOTEBOOKS.glob("[0-9]*.ipynb")):
         execute(path.stem, path, {})

@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Mapping
 from functools import partial
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,14 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from helpers import drawings, figures, scorecard, statistics, tables
-from helpers.artifacts import ArtifactError, code_revision, versions
+from helpers.artifacts import ArtifactError, code_revision
 from helpers.collection import ONLINE, Results
+from helpers.identity import digest, versions
 from helpers.params import OnlineParams
 from helpers.session import parameters_hash
-from helpers.sources import PROJECT, fingerprint
+from helpers.sources import PROJECT
 
+RUNNERS = ("papermill", "snakemake", "pypandoc_binary")  # packages that shape no number
 TEMPLATE = PROJECT / "reports/template"
 BENCHMARKS = PROJECT / "reports/reference/benchmarks"  # of make bench, a run of its own
 OF_THE_PAPER = {"control_case_1": 3, "tracking_case_2": 4, "control_case_2": 5, "control_case_3": 6}  # numbers of its figures
@@ -112,41 +115,42 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     return tabulated
 
 
-def changed_since(records: list[dict[str, Any]]) -> list[str]:
-    """The notebooks whose code, or that of a module behind them, is no longer what made a stage."""
-    found = {(record["notebook"], record.get("code")) for record in records}
-    return sorted({notebook for notebook, code in found if code != fingerprint(notebook)})
-
-
 def provenance(results: Results) -> dict[str, Any]:
-    """Where the report comes from: code, versions, seeds, parameters and time."""
+    """Where the report comes from: code, versions, seeds, parameters and time; `identity` is that of all its stages."""
     records = [stage.record for stage in results.stages.values()]
     return {
         "scale": results.scale,
         "seeds": sorted({seed for _, seed, _ in results.stages}),
         "revision": code_revision(PROJECT),
         "revisions_of_stages": sorted({record["revision"] for record in records}),
-        "notebooks_changed_since": changed_since(records),
-        "versions": versions(),
+        "identity": digest(sorted(record.get("identity", "") for record in records)),
+        "inputs": dict(results.made_from),
+        "missing_seeds": list(results.missing),
+        "versions": versions() | {name: metadata.version(name) for name in RUNNERS},
         "parameters": {str(case): parameters_hash(params) for case, params in results.params.items()},
         "stage_seconds": sum(record["seconds"] for record in records),
         "processor_threads": os.cpu_count(),
     }
 
 
-def write(folder: Path, results: Results) -> Path:
+def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] | None = None) -> Path:
     """Write report.html, figures/, tables/, comparison.csv, seeds.csv and provenance.json; returns the report's path.
 
     What an earlier report left in those places is replaced; other files of the folder stay.
+
+    Args:
+        tabulated: what `tabulate` gave for these results, if it was asked before.
     """
     partial = folder / f".partial.{os.getpid()}"
     shutil.rmtree(partial, ignore_errors=True)
     try:
         for name in ("figures", "tables"):
             (partial / name).mkdir(parents=True)
-        drawn, tabulated, origin = draw(results), tabulate(results), provenance(results)
+        drawn, origin = draw(results), provenance(results)
+        tabulated = tabulate(results) if tabulated is None else tabulated
         for name, figure in drawn.items():
             figure.savefig(partial / "figures" / f"{name}.svg", metadata={"Date": None})
+            figure.set_layout_engine("none")  # it stays as the first file was laid out: a layout costs as much as drawing
             figure.savefig(partial / "figures" / f"{name}.png")
         for name, frame in tabulated.items():
             frame.to_csv(partial / "tables" / f"{name}.csv", index=False, float_format="%.10g")

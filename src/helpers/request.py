@@ -13,12 +13,14 @@ NOTEBOOK_PARAMETERS = {
     "case": int,
     "seed": int,
     "seeds": int,
+    "missing": int,
     "scale": str,
     "variant": str,
     "input_root": str,
     "output_root": str,
     "params_root": str,
 }
+WRITABLE = ("results", "reports")
 
 
 class SessionError(InputError):
@@ -51,9 +53,10 @@ def check_parameters(notebook: str, given: Mapping[str, Any]) -> Params:
         if name in given and type(given[name]) is not kind:
             words = "a whole number" if kind is int else "a text"
             raise SessionError(f"{where}: parameter '{name}': expected {words}, found {given[name]!r}")
-    for name, least in (("seed", 0), ("seeds", 1)):
+    for name, least in (("seed", 0), ("seeds", 1), ("missing", 0)):
         if given.get(name, least) < least:
             raise SessionError(f"{where}: parameter '{name}': expected {least} or more, found {given[name]}")
+    check_place("output_root", Path(given.get("output_root") or PROJECT / "results"))
     params = load(Path(given.get("params_root") or PROJECT / "params").resolve(), given.get("case", 1))
     variants = [name for name in params.learning.variants if name not in params.trials]
     for name, known, shown in (
@@ -63,3 +66,14 @@ def check_parameters(notebook: str, given: Mapping[str, Any]) -> Params:
         if name in given and given[name] not in known:
             raise SessionError(f"{where}: parameter '{name}': expected one of {', '.join(shown)}, found '{given[name]}'")
     return params
+
+
+def check_place(name: str, place: Path) -> None:
+    """Refuse a place inside the project that is not among results and reports: no run may write over what it is made of.
+
+    Links and dots are resolved first.
+    """
+    found = place.resolve()
+    if found.is_relative_to(PROJECT) and not any(found.is_relative_to(PROJECT / folder) for folder in WRITABLE):
+        where = " and ".join(f"{folder}/" for folder in WRITABLE)
+        raise SessionError(f"parameter '{name}': inside the project results go below {where}, not to {found}")

@@ -1,6 +1,7 @@
 """Process and controller in closed loop: batched episodes."""
 
 import torch
+from torch import Tensor
 
 from helpers.controllers import Controller
 from helpers.process import Process
@@ -21,21 +22,22 @@ def rollout(
     meets do not depend on the controller, so that two controllers can be compared on the same draws.
     """
     n_steps = task.n_steps
-    dtype = task.set_point.dtype
-    start = torch.randn(n_trajectories, process.n_states, generator=generator, dtype=dtype)
-    disturbance = torch.randn(n_steps, n_trajectories, process.n_states, generator=generator, dtype=dtype)
-    observation = torch.randn(n_steps + 1, n_trajectories, process.n_outputs, generator=generator, dtype=dtype)
-    x = torch.empty(n_steps + 1, n_trajectories, process.n_states, dtype=dtype)
-    y = torch.empty(n_steps + 1, n_trajectories, process.n_outputs, dtype=dtype)
-    u = torch.empty(n_steps, n_trajectories, process.n_inputs, dtype=dtype)
-    command = torch.empty_like(u)
-    x[0] = task.initial_mean + task.initial_std * start
-    y[0] = process.observe(x[0], observation[0])
+
+    def draw(n_times: int, n_variables: int) -> tuple[Tensor, ...]:
+        # In memory the trajectories come last: a step then works on long rows, not on many short ones.
+        return torch.randn(n_times, n_variables, n_trajectories, generator=generator, dtype=task.set_point.dtype).mT.unbind(0)
+
+    (start,) = draw(1, process.n_states)
+    disturbance, noise = draw(n_steps, process.n_states), draw(n_steps + 1, process.n_outputs)
+    x = [task.initial_mean + task.initial_std * start]
+    y = [process.observe(x[0], noise[0])]
+    u, command = [], []
     with torch.no_grad():
         memory = controller.start(n_trajectories, n_steps, generator)
         for t in range(n_steps):
-            command[t], memory = controller.act(y[t], memory)
-            torch.clamp(command[t], task.input_low, task.input_high, out=u[t])
-            x[t + 1] = process.step(x[t], u[t], disturbance[t])
-            y[t + 1] = process.observe(x[t + 1], observation[t + 1])
-    return Trajectories(x, y, u, command)
+            asked, memory = controller.act(y[t], memory)
+            command.append(asked)
+            u.append(torch.clamp(asked, task.input_low, task.input_high))
+            x.append(process.step(x[t], u[t], disturbance[t]))
+            y.append(process.observe(x[t + 1], noise[t + 1]))
+    return Trajectories(*(torch.stack([entry.T for entry in signal]).mT for signal in (x, y, u, command)))

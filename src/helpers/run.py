@@ -6,6 +6,7 @@ import re
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,12 @@ from papermill.exceptions import PapermillExecutionError
 from traitlets.config import Config
 
 from helpers.params import ParameterError
-from helpers.request import SessionError, check_parameters
+from helpers.request import SessionError, check_parameters, check_place
+from helpers.scratch import beside, sweep
 from helpers.sources import PROJECT
 
 NOTEBOOKS = PROJECT / "notebooks"
+HEADLINE = "improved"  # the variant behind the report's numbers; cells with this tag are run for it alone
 
 
 def execute(notebook: str, output: Path, parameters: dict[str, Any]) -> None:
@@ -33,20 +36,24 @@ def execute(notebook: str, output: Path, parameters: dict[str, Any]) -> None:
         ParameterError, SessionError: if the parameters cannot be used; nothing was run then.
         PapermillExecutionError: if a cell failed; its traceback stands in the executed copy.
     """
-    source = NOTEBOOKS / f"{notebook}.ipynb"
-    if not source.is_file():
-        known = ", ".join(sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb")))
-        raise SessionError(f"{source}: there is no such notebook; the notebooks are {known}")
+    source, known = NOTEBOOKS / f"{notebook}.ipynb", sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb"))
+    if notebook not in known:
+        raise SessionError(f"{source}: there is no such notebook; the notebooks are {', '.join(known)}")
     check_parameters(notebook, parameters)
     output.parent.mkdir(parents=True, exist_ok=True)
+    sweep(output)
     # Kernels started side by side race for TCP ports; where the platform has Unix sockets, a fresh folder for each
     # kernel's sockets avoids the race. Its path must stay short: socket names are limited to about 100 characters.
     with tempfile.TemporaryDirectory(prefix="hk") as sockets:
         config = Config()
+        # Papermill has every output by the time it stops the kernel, so the kernel need not take itself apart first.
+        config.NotebookClient.shutdown_kernel = "immediate"
+        if parameters.get("variant", HEADLINE) != HEADLINE:
+            config.NotebookClient.skip_cells_with_tag = HEADLINE  # what only the headline variant is needed for
         if os.name == "posix":
             config.KernelManager.transport = "ipc"
             config.KernelManager.ip = str(Path(sockets) / "k")
-        partial = output.with_name(f".{output.stem}.{os.getpid()}.ipynb")
+        partial = beside(output)
         try:
             papermill.execute_notebook(
                 source,
@@ -100,20 +107,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     os.environ["TQDM_DISABLE"] = "1"
     parameters = {name: _value(name, text) for name, text in given.parameter}
+    if parameters.get("seed"):
+        os.environ["MPLBACKEND"] = "agg"  # copies of other seeds than the first are not published: no pictures in them
+    else:
+        os.environ.pop("MPLBACKEND", None)  # the kernel's own, which puts pictures into the notebook
     what = " ".join([given.notebook, *(f"{name}={value}" for name, value in parameters.items() if not name.endswith("_root"))])
+    failed = given.output.with_suffix(".failed")  # what went wrong, for the summary at the end of a long run
     try:
+        check_place("output", given.output)
+        failed.unlink(missing_ok=True)
         execute(given.notebook, given.output, parameters)
     except (ParameterError, SessionError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except PapermillExecutionError as error:
-        print(f"error: {what}: {error.ename}: {error.evalue} (executed copy with the traceback: {given.output})", file=sys.stderr)
-        return 1
+        sentence = f"{what}: {error.ename}: {error.evalue} (executed copy with the traceback: {given.output})"
     except DeadKernelError:
-        print(f"error: {what}: the kernel died (executed copy up to there: {given.output})", file=sys.stderr)
-        return 1
-    print(f"done: {what}")
-    return 0
+        sentence = f"{what}: the kernel died (executed copy up to there: {given.output})"
+    except OSError as error:
+        sentence = f"{what}: {error.filename or given.output}: could not be written: {error.strerror or error}"
+    else:
+        print(f"done: {what}")
+        return 0
+    print(f"error: {sentence}", file=sys.stderr)
+    with suppress(OSError):  # the disk may be full
+        failed.write_text(f"{sentence}\n", encoding="utf-8")
+    return 1
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """What a notebook knows of its run: its parameters, checked, and the objects that they describe."""
 
-import hashlib
-import json
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -15,8 +13,10 @@ from IPython.display import Markdown
 from matplotlib.figure import Figure
 
 from helpers import artifacts
+from helpers.checkpoint import Checkpoint, Checkpoints
 from helpers.controllers import PID, MinimumVariance
 from helpers.features import FeatureMap, feature_names
+from helpers.identity import changes, digest, identity, inputs, versions
 from helpers.params import (
     IdentificationParams,
     IdentificationScaleParams,
@@ -24,39 +24,86 @@ from helpers.params import (
     PublishedCase,
     ScaleParams,
     VariantParams,
-    list_leaves,
     load,
     load_identification,
     load_published,
-    read_yaml,
 )
 from helpers.policy import LSTMPolicy
 from helpers.process import LinearProcess
 from helpers.randomness import stream
 from helpers.request import NOTEBOOK_PARAMETERS, SessionError, check_parameters, parameter_names
-from helpers.sources import PROJECT, fingerprint
+from helpers.sources import PROJECT
 from helpers.task import ControlTask
 
 PLAIN = (str, int, float, list, dict, type(None))
 IPYTHON_NAMES = ("In", "Out")
 
 
-@dataclass(frozen=True)
-class Session:
-    """One run of one notebook."""
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """One run of one notebook: what it was given, and where its results come from.
+
+    Attributes:
+        made_from: `identity.inputs` as they were when the run began.
+        upstream: the earlier results that it read, by folder, and the hash of their files.
+    """
 
     notebook: str
-    case: int
     seed: int
     scale: str
-    variant: str
-    input_root: Path
     output_root: Path
     params_root: Path
+    made_from: Mapping[str, str]
+    upstream: dict[str, str] = field(default_factory=dict)
+    started: float = field(default_factory=time.perf_counter)
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """The run's own parameters, but for folders."""
+        names = ("case", "seed", "scale", "variant")
+        return {name: getattr(self, name) for name in names if hasattr(self, name)}
+
+    def inputs_now(self) -> dict[str, str]:
+        """`made_from` as it would be if the run began now."""
+        own = {name: self.given[name] for name in ("case", "variant") if name in self.given}
+        return inputs(self.notebook, self.params_root, self.scale, **own)
+
+    def origin(self) -> dict[str, Any]:
+        """Where a result of this run comes from, for its record.
+
+        Raises:
+            SessionError: if code or parameters have changed since the run began, because nobody could tell what made it.
+        """
+        if changed := changes({"inputs": self.made_from}, self.inputs_now()):
+            raise SessionError(f"notebooks/{self.notebook}.ipynb: {', '.join(changed)} changed during the run; run it again")
+        run = {"notebook": self.notebook, **self.given}
+        return {
+            **run,
+            "identity": identity(run, self.made_from, self.upstream),
+            "inputs": dict(self.made_from),
+            "upstream": dict(self.upstream),
+            "seconds": time.perf_counter() - self.started,
+            "revision": artifacts.code_revision(PROJECT),
+            "versions": versions(),
+        }
+
+    def settings_table(self, scale_params: ScaleParams | IdentificationScaleParams) -> pd.DataFrame:
+        """What the notebook was run with. Columns: setting, value."""
+        scale = {f"scale.{key}": value for key, value in scale_params.model_dump().items()}
+        return pd.DataFrame([{"setting": key, "value": str(value)} for key, value in (self.given | scale).items()])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Session(Run):
+    """One run of a notebook for one case."""
+
+    case: int
+    variant: str
+    input_root: Path
     params: Params
     scale_params: ScaleParams
     variant_params: VariantParams
-    started: float = field(default_factory=time.perf_counter)
+    checkpoints: Checkpoints
 
     @property
     def dtype(self) -> torch.dtype:
@@ -122,23 +169,23 @@ class Session:
 
     def load(self, stage: str, made_by: str, case: int | None = None) -> artifacts.Stage:
         """A finished earlier stage; `made_by` is the notebook to run where it is missing."""
-        return artifacts.load_stage(self.folder(self.input_root, stage, case), f"{made_by} for case {case or self.case}")
+        found = artifacts.load_stage(self.folder(self.input_root, stage, case), f"{made_by} for case {case or self.case}")
+        self.upstream[f"case_{case or self.case}/{stage}"] = found.content
+        return found
 
-    def save(self, stage: str, tables: Mapping[str, pd.DataFrame], policy: LSTMPolicy | None = None) -> artifacts.Stage:
-        """Write a stage's results with a record of where they come from."""
-        record = {
-            "notebook": self.notebook,
-            "case": self.case,
-            "seed": self.seed,
-            "scale": self.scale,
-            "variant": self.variant,
-            "parameters": parameters_hash(self.params),
-            "seconds": time.perf_counter() - self.started,
-            "revision": artifacts.code_revision(PROJECT),
-            "code": fingerprint(self.notebook),
-            "versions": artifacts.versions(),
-        }
-        return artifacts.save_stage(self.folder(self.output_root, stage), record, tables, policy)
+    def save(
+        self, stage: str, tables: Mapping[str, pd.DataFrame], policy: LSTMPolicy | None = None, last: bool = True
+    ) -> artifacts.Stage:
+        """Write a stage's results with a record of where they come from; `last`: this run writes no other stage."""
+        saved = artifacts.save_stage(self.folder(self.output_root, stage), self.origin(), tables, policy)
+        self.upstream[f"case_{self.case}/{stage}"] = saved.content
+        if last:
+            self.checkpoints.remove()
+        return saved
+
+    def checkpoint(self, *start: Any) -> Checkpoint:
+        """Where a training of this run keeps its state; `start`: all that it starts from beside the session's parameters."""
+        return self.checkpoints.of(self.params, *start)
 
     def banner(self) -> Markdown:
         """What kind of run this is, for the top of the notebook."""
@@ -153,9 +200,7 @@ class Session:
 
     def settings(self) -> pd.DataFrame:
         """What the notebook was run with."""
-        scale = {f"scale.{key}": value for key, value in self.scale_params.model_dump().items()}
-        given = {"case": self.case, "seed": self.seed, "scale": self.scale, "variant": self.variant}
-        return pd.DataFrame([{"setting": key, "value": str(value)} for key, value in (given | scale).items()])
+        return self.settings_table(self.scale_params)
 
 
 def parameters_hash(params: Params) -> str:
@@ -165,8 +210,7 @@ def parameters_hash(params: Params) -> str:
 
 def leaves_hash(leaves: Iterable[Mapping[str, Any]]) -> str:
     """A hash of the values of leaves."""
-    content = json.dumps([[leaf["file"], leaf["key"], leaf["value"]] for leaf in leaves], sort_keys=True)
-    return hashlib.sha256(content.encode()).hexdigest()
+    return digest([[leaf["file"], leaf["key"], leaf["value"]] for leaf in leaves])
 
 
 @dataclass(frozen=True)
@@ -191,22 +235,16 @@ class ReportSession:
         )
 
 
-@dataclass(frozen=True)
-class IdentificationSession:
+@dataclass(frozen=True, kw_only=True)
+class IdentificationSession(Run):
     """One run of the notebook that infers settings from the expert rows of all cases that the paper printed.
 
-    `params` holds the parameters of each case and `leaves` those of all files read.
+    `params` holds the parameters of each case.
     """
 
-    notebook: str
-    seed: int
-    scale: str
-    output_root: Path
     params: Mapping[int, Params]
     published: Mapping[int, PublishedCase]
     identification: IdentificationParams
-    leaves: tuple[dict[str, Any], ...]
-    started: float = field(default_factory=time.perf_counter)
 
     @property
     def scale_params(self) -> IdentificationScaleParams:
@@ -215,18 +253,8 @@ class IdentificationSession:
 
     def save(self, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, Figure]) -> artifacts.Stage:
         """Write the results with a record of where they come from; they belong to a seed and to no case."""
-        record = {
-            "notebook": self.notebook,
-            "seed": self.seed,
-            "scale": self.scale,
-            "parameters": leaves_hash(self.leaves),
-            "seconds": time.perf_counter() - self.started,
-            "revision": artifacts.code_revision(PROJECT),
-            "code": fingerprint(self.notebook),
-            "versions": artifacts.versions(),
-        }
         folder = self.output_root / self.scale / f"seed_{self.seed}" / "inferred_settings"
-        return artifacts.save_stage(folder, record, tables, figures=figures)
+        return artifacts.save_stage(folder, self.origin(), tables, figures=figures)
 
     def banner(self) -> Markdown:
         """What kind of run this is, for the top of the notebook."""
@@ -240,9 +268,7 @@ class IdentificationSession:
 
     def settings(self) -> pd.DataFrame:
         """What the notebook was run with."""
-        scale = {f"scale.{key}": value for key, value in self.scale_params.model_dump().items()}
-        given = {"seed": self.seed, "scale": self.scale}
-        return pd.DataFrame([{"setting": key, "value": str(value)} for key, value in (given | scale).items()])
+        return self.settings_table(self.scale_params)
 
 
 def _given(notebook: str, namespace: dict[str, Any]) -> tuple[dict[str, Any], Params]:
@@ -288,18 +314,24 @@ def open_session(notebook: str, namespace: dict[str, Any]) -> Session:
     scale, variant = given["scale"], given.get("variant", "improved")
     scale_params = params.learning.scales[scale]
     torch.set_num_threads(scale_params.threads)
+    case, seed = given.get("case", 1), given["seed"]
+    output_root, params_root = _root(given, "output_root", "results"), _root(given, "params_root", "params")
+    made_from = inputs(notebook, params_root, scale, case, variant)
+    hidden = output_root / scale / f"seed_{seed}" / f"case_{case}" / f".checkpoints_{notebook}_{variant}"
     return Session(
         notebook=notebook,
-        case=given.get("case", 1),
-        seed=given["seed"],
+        seed=seed,
         scale=scale,
+        output_root=output_root,
+        params_root=params_root,
+        made_from=made_from,
+        case=case,
         variant=variant,
         input_root=_root(given, "input_root", _inputs(scale)),
-        output_root=_root(given, "output_root", "results"),
-        params_root=_root(given, "params_root", "params"),
         params=params,
         scale_params=scale_params,
         variant_params=params.learning.variants[variant],
+        checkpoints=Checkpoints(hidden, digest([made_from, case, seed, scale, variant]), scale_params.checkpoint_interval),
     )
 
 
@@ -324,15 +356,15 @@ def open_identification(notebook: str, namespace: dict[str, Any]) -> Identificat
     params_root = _root(given, "params_root", "params")
     published = load_published(params_root)
     params = {case: load(params_root, case) for case in sorted(published)}
-    own = list_leaves(read_yaml(params_root / "identification.yaml"), "identification.yaml")
     torch.set_num_threads(first.learning.scales[given["scale"]].threads)
     return IdentificationSession(
         notebook=notebook,
         seed=given["seed"],
         scale=given["scale"],
         output_root=_root(given, "output_root", "results"),
+        params_root=params_root,
+        made_from=inputs(notebook, params_root, given["scale"]),
         params=params,
         published=published,
         identification=load_identification(params_root, first),
-        leaves=(*(leaf for record in params.values() for leaf in record.leaves), *own),
     )

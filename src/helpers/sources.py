@@ -7,45 +7,56 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-PACKAGE = Path(__file__).resolve().parent
-PROJECT = PACKAGE.parents[1]
+PROJECT = Path(__file__).resolve().parents[2]
+PACKAGE = "helpers"
 
 
-def notebook_path(notebook: str) -> Path:
+def notebook_path(notebook: str, project: Path = PROJECT) -> Path:
     """Where a notebook of this name lies."""
-    return PROJECT / "notebooks" / f"{notebook}.ipynb"
+    return project / "notebooks" / f"{notebook}.ipynb"
 
 
-def modules_behind(notebook: str) -> list[Path]:
+def modules_behind(notebook: str, project: Path = PROJECT) -> list[Path]:
     """Every module of this package that a notebook imports, by itself or through another one, in alphabetical order.
 
     Imports inside functions count: they run too.
     """
+    package = project / "src" / PACKAGE
     found: set[Path] = set()
-    waiting = list(_imported(_code(notebook)))
+    waiting = [package / f"{name}.py" for name in _imported(_code(notebook, project))]
     while waiting:
         path = waiting.pop()
-        if path not in found:
+        if path not in found and path.is_file():
             found.add(path)
-            waiting += _imported(path.read_text(encoding="utf-8"))
+            waiting += [package / f"{name}.py" for name in _imported(path.read_text(encoding="utf-8"))]
     return sorted(found)
 
 
-def fingerprint(notebook: str) -> str:
-    """A hash of the code behind a notebook's results: its own and that of its modules. Comments and layout do not count."""
-    codes = [_code(notebook), *(path.read_text(encoding="utf-8") for path in modules_behind(notebook))]
-    return hashlib.sha256("\n".join(ast.dump(ast.parse(code)) for code in codes).encode()).hexdigest()
+def code_behind(notebook: str, project: Path = PROJECT) -> dict[str, str]:
+    """A hash of the code of a notebook and of each module behind it, by path.
 
-
-def _code(notebook: str) -> str:
-    cells = json.loads(notebook_path(notebook).read_text(encoding="utf-8"))["cells"]
-    return "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    Comments and layout do not count, nor does the notebook's cell of parameters, whose values are another part of a run.
+    """
+    codes = {notebook_path(notebook, project): _code(notebook, project)}
+    codes |= {path: path.read_text(encoding="utf-8") for path in modules_behind(notebook, project)}
+    return {path.relative_to(project).as_posix(): _hash(code) for path, code in codes.items()}
 
 
 @cache
-def _imported(code: str) -> tuple[Path, ...]:
-    """The modules of this package that a piece of code names in its import statements."""
-    return tuple(path for name in _import_names(code) if (path := PACKAGE / f"{name}.py").is_file())
+def _hash(code: str) -> str:
+    return hashlib.sha256(ast.dump(ast.parse(code)).encode()).hexdigest()
+
+
+def _code(notebook: str, project: Path) -> str:
+    cells = json.loads(notebook_path(notebook, project).read_text(encoding="utf-8"))["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code" and "parameters" not in cell["metadata"].get("tags", [])]
+    return "\n".join("".join(cell["source"]) for cell in code)
+
+
+@cache
+def _imported(code: str) -> tuple[str, ...]:
+    """What a piece of code names of this package in its import statements: modules, and names that may be none."""
+    return tuple(_import_names(code))
 
 
 def _import_names(code: str) -> Iterator[str]:
@@ -58,5 +69,5 @@ def _import_names(code: str) -> Iterator[str]:
             continue
         for name in names:
             parts = name.split(".")
-            if parts[0] == PACKAGE.name and len(parts) > 1:
+            if parts[0] == PACKAGE and len(parts) > 1:
                 yield parts[1]

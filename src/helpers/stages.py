@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from helpers.artifacts import ArtifactError, trajectories_from_table
+from helpers.checkpoint import Checkpoint
 from helpers.controllers import Controller
 from helpers.evaluation import feature_gap, relative_gap, scores
 from helpers.features import FeatureMap
@@ -76,14 +77,30 @@ def imitate(session: Session, demonstrations: Demonstrations, policy: LSTMPolicy
     policy.reset_exploration(variant.exploration)
     generator = session.stream("offline", session.params.base(session.variant))
     learner = Learner(policy, session.process, session.features, variant.learner, scale.episodes, n_epochs, generator)
+    expert_features = demonstrations.features(session.features)
     return maxent_irl(
         learner,
-        demonstrations.features(session.features),
+        expert_features,
         start,
         variant.weights,
         n_iterations,
         scale.measured,
         ProgressBar(n_epochs, "offline"),
+        memory(session, learner, expert_features, start),
+    )
+
+
+def memory(session: Session, learner: Learner, *more: Any) -> Checkpoint:
+    """Where a learner that has not begun keeps its state; `more`: what its training starts from beside learner and session."""
+    return session.checkpoint(
+        session.variant,
+        vars(learner.features),
+        learner.params,
+        learner.n_episodes,
+        learner.total_epochs,
+        learner.generator.get_state(),
+        *learner.policy.state_dict().values(),
+        *more,
     )
 
 
@@ -109,7 +126,8 @@ def improve(session: Session, policy: LSTMPolicy, features_on: str, episodes: in
     learner = Learner(
         policy, session.process, session.features.on(features_on), learning.learner, n_episodes, sum(epochs), generator
     )
-    records = improve_online(learner, epochs, online.beta, ProgressBar(sum(epochs), f"online on {features_on}"))
+    bar = ProgressBar(sum(epochs), f"online on {features_on}")
+    records = improve_online(learner, epochs, online.beta, bar, memory(session, learner, epochs, online.beta))
     return Improvement(learner.average, tuple(records))
 
 

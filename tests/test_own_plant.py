@@ -1,0 +1,126 @@
+"""From a historian file to a controller, for any number of controlled and manipulated variables, without a change of code."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from plants import HORIZON, MadeUpPlant
+
+from helpers import own_plant, plant_report
+from helpers.deployment import DeployedPolicy
+from helpers.params import ParameterError
+
+
+def small(plant):
+    """A few epochs with a few episodes: enough to see that everything fits together."""
+    learning = plant.learning.model_copy(update={"policy": plant.learning.policy.model_copy(update={"hidden_cells": (6, 6)})})
+    scale = plant.scale.model_copy(update={"episodes": 16, "measured": 4, "evaluation": 10, "epoch_share": 0.02})
+    return replace(plant, scale=scale, learning=learning)
+
+
+@pytest.mark.parametrize(("n_y", "n_u"), [(1, 1), (3, 2), (2, 3)])
+def test_the_whole_chain_runs_for_any_number_of_variables(n_y, n_u, tmp_path, root):
+    path = MadeUpPlant(n_y, n_u).write(tmp_path)
+    plant = small(own_plant.open_plant(path, root, "smoke", 0))
+    identified, validation = own_plant.identify_plant(plant)
+    assert (validation.fit > 0.5).all()
+    model = identified.model.to(plant.dtype)
+    task = own_plant.task_on(plant, model)
+    assert task.initial_mean.shape == (model.n_states,)
+    offline = own_plant.learn_offline(plant, model, task)
+    assert len(offline.records) == 6
+    assert offline.weights.shape == (3 * n_y,)
+    online, records = own_plant.improve_on(plant, offline.policy, model, task)
+    assert records[-1].gradient_steps == 32
+    judged = own_plant.judge(plant, task, own_plant.compare(plant, model, task, {"online": online}))
+    assert len([row for row in judged.index if row.startswith("movement:")]) == n_u
+    assert np.isfinite(judged["online"].drop([row for row in judged.index if row.startswith("rise_time")])).all()
+    assert plant_report.export_policy(plant, online, model, task, tmp_path / "policy.onnx") < 1e-5
+    notes = DeployedPolicy(tmp_path / "policy.onnx").notes
+    assert [entry["tag"] for entry in notes["controlled"]] == [f"Y{i}.PV" for i in range(n_y)]
+
+
+def test_the_features_are_those_of_the_record_and_on_y(tmp_path, root):
+    plant = own_plant.open_plant(MadeUpPlant(2, 2).write(tmp_path), root, "smoke", 0)
+    found, task = plant.demonstrations, plant.task(torch.zeros(2), torch.zeros(2))
+    features = plant.features(task)
+    assert features.params.features_on == "y"
+    assert found.trajectories.y.shape[0] == HORIZON + 1
+    errors = (task.set_point - found.trajectories.y[1:]) / task.error_scale
+    assert features.errors(found.trajectories).numpy() == pytest.approx(errors.numpy())
+    assert own_plant.judge(plant, task, {"record": found.trajectories}).loc["feature gap", "record"] == 0
+
+
+def test_a_lagged_model_begins_at_rest_where_the_demonstrations_began(tmp_path, root):
+    plant = own_plant.open_plant(MadeUpPlant(2, 3).write(tmp_path), root, "smoke", 0)
+    identification = plant.params.identification.model_copy(update={"lags": (3,)})
+    plant = replace(plant, params=plant.params.model_copy(update={"identification": identification}))
+    identified, _ = own_plant.identify_plant(plant)
+    task = own_plant.task_on(plant, identified.model.to(plant.dtype))
+    y, u = plant.demonstrations.trajectories.y[0].mean(0).tolist(), plant.demonstrations.before.mean(0).tolist()
+    assert task.initial_mean.tolist() == pytest.approx([*y, *y, *y, *u, *u])
+
+
+def test_a_transfer_takes_policy_and_weights_to_another_set_point(tmp_path, root):
+    made_up = MadeUpPlant(2, 2)
+    table = made_up.table.copy()
+    half = len(table) // 2
+    for index in range(2):  # the second half steps to a set point half as far
+        rest = made_up.steady_y[index]
+        for tag in (f"Y{index}.SP", f"Y{index}.PV"):
+            table.loc[half:, tag] = rest + (table.loc[half:, tag] - rest) / 2
+    plant = small(own_plant.open_plant(made_up.write(tmp_path, table), root, "smoke", 0))
+    other = plant.with_set_points({f"y{i}": float(made_up.steady_y[i] + made_up.set_point[i] / 2) for i in range(2)})
+    assert plant.demonstrations.trajectories.n_trajectories == other.demonstrations.trajectories.n_trajectories == 15
+    identified, _ = own_plant.identify_plant(plant)
+    model = identified.model.to(plant.dtype)
+    offline = own_plant.learn_offline(plant, model, own_plant.task_on(plant, model))
+    transferred = own_plant.learn_offline(other, model, own_plant.task_on(other, model), (offline.policy, offline.weights))
+    assert len(transferred.records) == 2
+    assert transferred.records[0].weights == pytest.approx(offline.weights.tolist())
+    with pytest.raises(ParameterError, match="set point of 'z': expected one of y0, y1"):
+        plant.with_set_points({"z": 1.0})
+
+
+@pytest.fixture
+def quick_root(root, tmp_path):
+    """The parameter files with a smoke scale that takes a second."""
+    folder = shutil.copytree(root, tmp_path / "params")
+    text = (folder / "learning.yaml").read_text(encoding="utf-8")
+    for old, new in (
+        ("epoch_share: {value: 0.1,", "epoch_share: {value: 0.02,"),
+        ("episodes: {value: 40,", "episodes: {value: 16,"),
+        ("evaluation: {value: 100,", "evaluation: {value: 10,"),
+        ("hidden_cells: {value: [20, 20]", "hidden_cells: {value: [6, 6]"),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "learning.yaml").write_text(text, encoding="utf-8")
+    return folder
+
+
+def test_the_command_goes_from_a_file_to_a_controller_and_a_report(tmp_path, quick_root, capsys):
+    path = MadeUpPlant(3, 2).write(tmp_path)
+    arguments = [str(path), "--output", str(tmp_path / "out"), "--scale", "smoke", "--params", str(quick_root)]
+    assert plant_report.main(arguments) == 0
+    said = capsys.readouterr().out
+    assert "online learning ran on the identified model: no plant is named" in said
+    assert "30 episodes of 12 samples" in said
+    report = (tmp_path / "out/report.md").read_text(encoding="utf-8")
+    for heading in ("# made up", "## Data quality", "## Model on held-out records", "## Reward weights", "## Controllers"):
+        assert heading in report
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {"report.md", "policy.onnx", "quality.png", "model.png"}
+    policy = DeployedPolicy(tmp_path / "out/policy.onnx")
+    y, u = np.array([[50.0, 51.0, 52.0]]), np.array([[20.0, 21.0]])
+    assert policy.step(y, y, u).shape == (1, 2)
+
+
+def test_what_cannot_be_used_is_one_sentence_and_a_status(tmp_path, quick_root, capsys):
+    path = MadeUpPlant(1, 1, n_cycles=2).write(tmp_path)
+    assert plant_report.main([str(path), "--scale", "smoke", "--params", str(quick_root), "--output", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith("error: plant.csv: 2 episodes of 12 samples")
+    path.write_text(path.read_text(encoding="utf-8").replace("time_unit: s", "time_unit: week"), encoding="utf-8")
+    assert plant_report.main([str(path), "--scale", "smoke"]) == 2
+    assert "key 'time_unit'" in capsys.readouterr().err

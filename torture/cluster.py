@@ -8,7 +8,6 @@ local run to the last bit, and stops what it started. Packages stay installed.
 import argparse
 import os
 import shutil
-import signal
 import socket
 import subprocess
 import sys
@@ -112,8 +111,7 @@ def one_node(folder: Path) -> Iterator[dict[str, str]]:
             yield environment
         finally:
             for process in reversed(started):
-                process.send_signal(signal.SIGTERM)
-            for process in reversed(started):
+                process.terminate()
                 try:
                     process.wait(20)
                 except subprocess.TimeoutExpired:

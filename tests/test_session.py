@@ -1,6 +1,7 @@
 """What a notebook knows of its run: wrong parameters end in one sentence; defaults hold from any working directory."""
 
 import json
+import shutil
 
 import pandas as pd
 import pytest
@@ -165,3 +166,30 @@ def test_a_saved_stage_records_where_it_comes_from(tmp_path):
     assert {"identity", "upstream", "revision", "versions", "seconds"} <= record.keys()
     loaded = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, seed=4, input_root=str(tmp_path))).load("offline_improved", "02")
     assert loaded.record == record
+
+
+def test_a_run_under_which_code_or_parameters_change_saves_nothing(tmp_path):
+    """As the notebook of a killed run may do, that lives on while its user edits and starts again."""
+    params = shutil.copytree(PROJECT / "params", tmp_path / "params")
+    given = globals_of_a_kernel(OFFLINE, params_root=str(params), output_root=str(tmp_path / "out"))
+    session = open_session(OFFLINE, given)
+    learning = params / "learning.yaml"
+    before = learning.read_text(encoding="utf-8")
+    learning.write_text(
+        before.replace("learning_rate_start: {value: 1.0e-2", "learning_rate_start: {value: 0.9e-2"), encoding="utf-8"
+    )
+    table = {"t.csv": pd.DataFrame({"a": [1]})}
+    assert "params/learning.yaml changed during the run; run it again" in refusal(session.save, "offline_improved", table)
+    assert not (tmp_path / "out").exists()
+    learning.write_text(f"# a comment\n{before}", encoding="utf-8")
+    assert session.save("offline_improved", table).record["inputs"] == session.made_from
+
+
+def test_a_result_names_the_earlier_results_that_it_read(tmp_path):
+    session = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, output_root=str(tmp_path)))
+    read = session.load("demonstrations", "01_demonstrations")
+    first = session.save("first", {"t.csv": pd.DataFrame({"a": [1]})}, last=False)
+    second = session.save("second", {"t.csv": pd.DataFrame({"a": [2]})})
+    assert first.record["upstream"] == {"case_1/demonstrations": read.content}
+    assert second.record["upstream"] == {"case_1/demonstrations": read.content, "case_1/first": first.content}
+    assert first.record["identity"] != second.record["identity"]

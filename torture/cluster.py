@@ -8,7 +8,6 @@ local run to the last bit, and stops what it started. Packages stay installed.
 import argparse
 import os
 import shutil
-import signal
 import socket
 import subprocess
 import sys
@@ -112,8 +111,7 @@ def one_node(folder: Path) -> Iterator[dict[str, str]]:
             yield environment
         finally:
             for process in reversed(started):
-                process.send_signal(signal.SIGTERM)
-            for process in reversed(started):
+                process.terminate()
                 try:
                     process.wait(20)
                 except subprocess.TimeoutExpired:
@@ -156,8 +154,9 @@ def compare(seeds: int, targets: Sequence[str], environment: dict[str, str], fol
             status = place.start(output=log, **extra).wait()
         seconds.append(time.perf_counter() - began)
         if status:
-            words = (place.project / "said.log").read_text(encoding="utf-8", errors="replace")
-            raise RuntimeError(f"the run in {place.project.name}/ failed:\n{words[-3000:]}")
+            logs = [place.project / "said.log", *place.project.glob(".snakemake/slurm_logs/**/*.log")]
+            words = [path.read_text(encoding="utf-8", errors="replace")[-2000:] for path in logs]
+            raise RuntimeError("\n".join([f"the run in {place.project.name}/ failed:", *words]))
     here, there = local.content(), cluster.content()
     differing = sum(there.get(name) != content for name, content in here.items()) + len(there.keys() - here.keys())
     return len(here), differing, seconds[0], seconds[1]

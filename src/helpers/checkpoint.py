@@ -12,6 +12,7 @@ import shutil
 import time
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -98,7 +99,8 @@ class Checkpoint:
             partial.replace(self.path)
         except OSError as error:
             warnings.warn(f"{self.path}: no checkpoint could be written: {error.strerror}", stacklevel=2)
-            partial.unlink(missing_ok=True)
+            with suppress(OSError):
+                partial.unlink()
 
 
 def _take_apart(value: Any, tensors: dict[str, Tensor]) -> Any:

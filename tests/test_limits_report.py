@@ -57,7 +57,7 @@ def test_one_seed_shows_its_monte_carlo_interval(results):
     gaps = found["limits_gaps"].set_index("controller")
     assert gaps.loc["offset-free MPC"].tolist() == ["10.0 [9.0, 11.0]", "20.0 [19.0, 21.0]"]
     budget = found["limits_budget"].set_index(["case", "controller"])
-    assert budget.loc[("II", "PPO from scratch")].tolist() == ["1.00", "20.0"]
+    assert budget.loc[("II", "PPO from scratch")].tolist() == ["1.00", "20.00"]
     worst = found["limits_robustness"].set_index(["case", "controller"])["model"]
     assert (worst["I", "offset-free MPC"], worst["I", "PID (demonstrator)"]) == ("100", "100")
     quality = found["limits_quality"].iloc[0]

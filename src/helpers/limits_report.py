@@ -11,6 +11,7 @@ from helpers.collection import DEMONSTRATIONS, Results
 from helpers.limits_figures import LABELS, budget_curves, gap_figure
 from helpers.tables import ROMAN, spread
 
+PLACES = 4  # digits after the point that count
 FIGURES = ("iae", "iae_worst", "offset", "overshoot", "settling_time_5", "total_variation", "at_bound", "harris")
 GROUPS = {"model": "model", "noise": "noise", "set_point": "set points", "time": "dead time and load"}
 RUNS = {"hot": "hot start", "scratch": "from scratch"}
@@ -48,8 +49,8 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     safety = read(results, "safety", "safety.csv").melt(["case", "seed", "run"], var_name="metric")
     return {
         "limits_gaps": _gaps(gaps),
-        "limits_budget": _wide(listed.rename(columns={"learner": "controller"}), int, "J after {:,}"),
-        "limits_robustness": _wide(worst.rename(columns={"group": "metric"}), str, "{}", GROUPS),
+        "limits_budget": _wide(listed.rename(columns={"learner": "controller"}), int, "J after {:,}", decimals=2),
+        "limits_robustness": _wide(worst.rename(columns={"group": "metric"}), str, "{}", GROUPS, decimals=0),
         "limits_quality": _quality(quality[kept]),
         "limits_safety": _wide(safety.rename(columns={"run": "controller"}), str, "{}", names=RUNS),
     } | ({"limits_curves": budget} if len(budget) else {})
@@ -73,15 +74,21 @@ def _gaps(gaps: pd.DataFrame) -> pd.DataFrame:
 
 
 def _wide(
-    frame: pd.DataFrame, kind: Callable, header: str, words: dict[str, str] | None = None, names: dict[str, str] | None = None
+    frame: pd.DataFrame,
+    kind: Callable,
+    header: str,
+    words: dict[str, str] | None = None,
+    names: dict[str, str] | None = None,
+    decimals: int | None = None,
 ) -> pd.DataFrame:
     """Medians of long rows (case, seed, controller, metric, value): a row for each case and controller, a column a metric."""
-    found, order, rows = _summary(frame), list(dict.fromkeys(frame["metric"])), []
+    found = _summary(frame.assign(value=frame["value"].round(PLACES)))  # a reward of 1e-90 is nought
+    order, rows = list(dict.fromkeys(frame["metric"])), []
     for case in sorted(frame["case"].unique()):
         numbers = found[found["case"] == case].set_index(["stage", "metric"])
         for name, label in (names or LABELS).items():
             if name in set(frame["controller"]):
-                cells = {metric: spread(numbers.reindex([(name, metric)]).iloc[0]) for metric in order}
+                cells = {metric: spread(numbers.reindex([(name, metric)]).iloc[0], decimals=decimals) for metric in order}
                 shown = {header.format(kind((words or {}).get(metric, metric))): cell for metric, cell in cells.items()}
                 rows.append({"case": ROMAN[case - 1], "controller": label} | shown)
     return pd.DataFrame(rows).rename(columns=lambda column: column.replace("_", " "))

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 import torch
 
-from helpers import equal_budget, limits, stages
+from helpers import equal_budget, exploration, limits, robustness, stages
 from helpers.attainable import Tabulated
 from helpers.evaluation import objective
 from helpers.limits_figures import LABELS, budget_curves, gap_figure, heat_maps, regret_figure
@@ -120,7 +120,7 @@ def test_the_scorecard_holds_every_figure_of_every_controller(contest, attained)
 
 
 def test_conditions_differ_in_what_they_name(contest):
-    found = {(one.group, one.row, one.column): one for one in limits.conditions(contest)}
+    found = {(one.group, one.row, one.column): one for one in robustness.conditions(contest)}
     assert len(found) == 25 + 16 + 16 + 4
     nominal = contest.session.process
     scaled = found["model", "1.3", "0.7"].plant.process
@@ -136,7 +136,7 @@ def test_conditions_differ_in_what_they_name(contest):
 
 
 def test_nominal_conditions_give_the_nominal_objective(contest):
-    table = limits.robustness(contest, {"expert": lambda run: run.expert})
+    table = robustness.robustness(contest, {"expert": lambda run: run.expert})
     table = table.set_index(["group", "row", "column"])["objective"]
     returns = contest.returns(stages.fresh_trajectories(contest.session, contest.session.expert, contest.scale.grid)).mean()
     for key in (("model", "1", "1"), ("noise", "1", "1"), ("set_point", "1", "1"), ("time", "0", "0")):
@@ -145,11 +145,11 @@ def test_nominal_conditions_give_the_nominal_objective(contest):
 
 
 def test_exploring_is_paired_with_the_pid_on_the_same_draws(contest):
-    episodes = limits.exploring_episodes(contest)
+    episodes = exploration.exploring_episodes(contest)
     assert episodes.groupby("run", sort=False).size().tolist() == [2 * contest.batch] * 2  # one epoch in each of two rounds
     hot, scratch = (group["expert"].to_numpy() for _, group in episodes.groupby("run", sort=False))
     assert hot == pytest.approx(scratch)  # both runs draw from the same stream, whatever their policies do
-    found = limits.safety(episodes).set_index("run").loc["scratch"]
+    found = exploration.safety(episodes).set_index("run").loc["scratch"]
     rows = episodes[episodes["run"] == "scratch"]
     assert found["worst"] == rows["objective"].min()
     assert found["regret"] == pytest.approx((rows["expert"] - rows["objective"]).sum())
@@ -165,7 +165,7 @@ def test_figures_show_the_tables(contest):
     )
     (axes,) = gap_figure(gaps).axes
     assert axes.lines[0].get_xdata().tolist() == [5.0, 20.0]  # the first controller on top
-    robust = limits.robustness(contest, {"expert": lambda run: run.expert, "mpc": lambda run: run.minimum_variance})
+    robust = robustness.robustness(contest, {"expert": lambda run: run.expert, "mpc": lambda run: run.minimum_variance})
     maps = heat_maps(robust, "time", ["expert", "mpc"])
     texts = [text.get_text() for text in maps.axes[1].texts]
     wanted = robust.query("group == 'time' and controller == 'mpc'")["objective"]

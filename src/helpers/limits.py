@@ -1,12 +1,9 @@
-"""The verbs of notebook 06: how far every controller is from the attainable, its quality, robustness and the price of learning."""
+"""The first verbs of notebook 06: how far every controller is from the attainable, and its control quality."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-import torch
 from IPython.display import Markdown
 from torch import Tensor
 
@@ -16,13 +13,9 @@ from helpers.control_quality import harris_index, quality
 from helpers.controllers import Controller
 from helpers.equal_budget import Build, Contest, Learned
 from helpers.evaluation import objective
-from helpers.experiments import Prepared, copied, prepare, varied
+from helpers.experiments import Prepared, prepare, varied
 from helpers.kalman import Filtered
 from helpers.limits_params import load_limits
-from helpers.mismatch import Delayed, LoadStep
-from helpers.policy import LSTMPolicy
-from helpers.process import Process
-from helpers.reinforce import Learner
 from helpers.rollout import rollout
 from helpers.session import Session
 from helpers.trajectories import Trajectories
@@ -200,176 +193,3 @@ def control_quality(contest: Contest, builds: Mapping[str, Build], stationary: M
         }
         rows += [(name, figure, value) for figure, value in figures.items()]
     return pd.DataFrame(rows, columns=["controller", "figure", "value"])
-
-
-# Robustness ----------------------------------------------------------------------------------------------------------
-
-
-class Condition(NamedTuple):
-    """A plant, and a set point that the controllers are told of.
-
-    Attributes:
-        group: which grid it belongs to; row, column: its place there.
-        told: the session that controllers are built for; plant: the one whose process they meet.
-    """
-
-    group: str
-    row: str
-    column: str
-    told: Session
-    plant: Session
-    load: float = 0.0
-    dead_time: int = 0
-
-
-def conditions(contest: Contest) -> list[Condition]:
-    """Every plant and set point of params/limits.yaml."""
-    session, params = contest.session, contest.params.robustness
-    process, case = session.params.process, session.params.case
-    found = []
-    for state in params.state_factors:
-        for entry in params.input_factors:
-            plant = mismatched(session, state, entry)
-            found.append(Condition("model", f"{state:g}", f"{entry:g}", session, plant))
-    for disturbance in params.disturbance_factors:
-        for noise in params.noise_factors:
-            changes = {
-                "disturbance": tuple(disturbance * gain for gain in process.disturbance),
-                "observation_noise": tuple(noise * std for std in process.observation_noise),
-            }
-            plant = varied(session, process=changes)
-            found.append(Condition("noise", f"{disturbance:g}", f"{noise:g}", session, plant))
-    for first in params.set_point_factors:
-        for others in params.set_point_factors:
-            factors = [first, *[others] * (len(case.set_point) - 1)]
-            target = tuple(factor * value for factor, value in zip(factors, case.set_point, strict=True))
-            told = varied(session, case={"set_point": target})
-            found.append(Condition("set_point", f"{first:g}", f"{others:g}", told, told))
-    for dead_time in (0, params.dead_time):
-        for load in (0.0, params.load):
-            found.append(Condition("time", f"{dead_time}", f"{load:g}", session, session, load, dead_time))
-    return found
-
-
-def mismatched(session: Session, state: float, entry: float) -> Session:
-    """The session with A and B of Eq. 4.1.3b scaled."""
-    process = session.params.process
-    drift_state = tuple(tuple(state * value for value in row) for row in process.drift_state)
-    drift_input = tuple(tuple(entry * value for value in row) for row in process.drift_input)
-    return varied(session, process={"drift_state": drift_state, "drift_input": drift_input})
-
-
-def robustness(contest: Contest, builds: Mapping[str, Build]) -> pd.DataFrame:
-    """The objective on x of every controller under every condition, on the same random draws.
-
-    Columns: group, row, column, controller, objective, standard_error.
-    """
-    rows = []
-    for condition in conditions(contest):
-        for name, build in builds.items():
-            batch = _under(contest, condition, build(condition.told))
-            returns = objective(batch, condition.told.features.on("x"), contest.beta).double()
-            error = returns.std().item() / len(returns) ** 0.5
-            rows.append((condition.group, condition.row, condition.column, name, returns.mean().item(), error))
-    return pd.DataFrame(rows, columns=["group", "row", "column", "controller", "objective", "standard_error"])
-
-
-def _under(contest: Contest, condition: Condition, controller: Controller) -> Trajectories:
-    task, plant = condition.told.task, condition.plant
-    process: Process = plant.process
-    if condition.load:
-        process = LoadStep(process, task, condition.load * task.error_scale)
-    if condition.dead_time:
-        controller = Delayed(controller, task, condition.dead_time)
-    return rollout(process, controller, task, contest.scale.grid, contest.session.stream("evaluation"))
-
-
-def improved_on_mismatch(contest: Contest) -> pd.DataFrame:
-    """Online improvement that starts on the mismatched plant: the objective there before and after, beside others.
-
-    Columns: state, input (factors), controller, objective. nominal: the policy that was improved on the plant of the model.
-    """
-    params, prepared, rows = contest.params.robustness, contest.prepared, []
-    for state, entry in zip(params.improve_state, params.improve_input, strict=True):
-        plant = mismatched(contest.session, state, entry)
-        improved = stages.improve(plant, copied(plant, prepared.imitator), "x").policy
-        controllers: dict[str, Controller] = {
-            "expert": plant.expert,
-            "offline": stages.deploy(plant, prepared.imitator),
-            "online": stages.deploy(plant, prepared.improved),
-            "online_there": stages.deploy(plant, improved),
-            "minimum_variance": contest.session.minimum_variance,
-        }
-        for name, controller in controllers.items():
-            batch = stages.fresh_trajectories(plant, controller, contest.scale.judged)
-            rows.append((state, entry, name, contest.returns(batch).mean().item()))
-    return pd.DataFrame(rows, columns=["state", "input", "controller", "objective"])
-
-
-# Safety of online learning -------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Watched:
-    """A reward that keeps the real objective of every exploring episode it is asked about."""
-
-    contest: Contest
-    beta: float
-    seen: list[Tensor]
-
-    def __call__(self, batch: Trajectories) -> Tensor:
-        """The rewards R_1..R_T with this beta, shape (T, K)."""
-        self.seen.append(self.contest.returns(batch))
-        return self.contest.session.features.on("x").tracking(batch, self.beta)
-
-
-def exploring_episodes(contest: Contest) -> pd.DataFrame:
-    """Every exploring episode of the case's online epochs, from the imitating policy (hot) and from an untrained one (scratch).
-
-    Beside each the episode that the PID would have had from the same initial state under the same disturbances. From scratch the
-    first round has the smaller beta of `dense`, without which there is nothing to learn from; all are judged by the real
-    objective. Columns: run, epoch, episode, objective, expert.
-    """
-    online = contest.session.params.case.online
-    starts = {
-        "hot": (contest.prepared.imitator, online.beta),
-        "scratch": (stages.fresh_policy(contest.session), (contest.params.dense.beta, *online.beta[1:])),
-    }
-    return pd.concat([_explore(contest, name, *start) for name, start in starts.items()], ignore_index=True)
-
-
-def _explore(contest: Contest, run: str, start: LSTMPolicy, betas: tuple[float, ...]) -> pd.DataFrame:
-    session = contest.session
-    online, generator = session.params.learning.online, session.stream("limits", "safety")
-    epochs = [session.epochs(n_epochs) for n_epochs in session.params.case.online.epochs]
-    policy = copied(session, start)
-    policy.reset_exploration(online.exploration)
-    features = session.features.on("x")
-    learner = Learner(policy, session.process, features, online.learner, contest.batch, sum(epochs), generator)
-    frames = []
-    for n_epochs, beta in zip(epochs, betas, strict=True):
-        for _ in range(n_epochs):
-            twin = torch.Generator().set_state(generator.get_state())
-            reward = Watched(contest, beta, [])
-            learner.epoch(reward)
-            paired = contest.returns(rollout(session.process, session.expert, session.task, contest.batch, twin))
-            columns = {"run": run, "epoch": learner.epochs, "objective": reward.seen[0].numpy(), "expert": paired.numpy()}
-            frames.append(pd.DataFrame(columns))
-    episodes = pd.concat(frames, ignore_index=True)
-    return episodes.assign(episode=np.arange(1, len(episodes) + 1))[["run", "epoch", "episode", "objective", "expert"]]
-
-
-def safety(episodes: pd.DataFrame) -> pd.DataFrame:
-    """The price of exploring: a row for each run.
-
-    worst: the least objective of an episode, worst_expert: the PID's on the same draws; worse: the share of episodes worse than
-    the PID's; regret: the sum of what they earned less than the PID (negative: more), regret_peak: the greatest sum on the way,
-    regret_episodes: the sum in mean episodes of the PID.
-    """
-    rows = []
-    for run, group in episodes.groupby("run", sort=False):
-        lost = group["expert"] - group["objective"]
-        row = {"run": run, "episodes": len(group), "worst": group["objective"].min(), "worst_expert": group["expert"].min()}
-        row |= {"worse": (lost > 0).mean(), "regret": lost.sum(), "regret_episodes": lost.sum() / group["expert"].mean()}
-        rows.append(row | {"regret_peak": lost.cumsum().max()})
-    return pd.DataFrame(rows)

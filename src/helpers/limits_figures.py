@@ -110,9 +110,9 @@ def heat_maps(robustness: pd.DataFrame, group: str, controllers: Sequence[str]) 
         values = table.loc[name].loc[rows, columns].to_numpy()
         share = 100 * values / reference
         axes.imshow(share, cmap=colours, norm=norm, aspect="auto")
-        for place, value in np.ndenumerate(values):
-            pale = 60 < share[place] < 140
-            axes.text(*place[::-1], f"{value:.1f}", ha="center", va="center", fontsize=7.5, color=INK if pale else "white")
+        for (row, column), value in np.ndenumerate(values):
+            pale = 60 < share[row, column] < 140
+            axes.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=7.5, color=INK if pale else "white")
         axes.set_xticks(range(len(columns)), columns if index >= len(controllers) - across else [""] * len(columns))
         axes.set_yticks(range(len(rows)), rows if index % across == 0 else [""] * len(rows))
         axes.set_title(LABELS[name], fontsize=9, loc="left")

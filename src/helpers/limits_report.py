@@ -1,0 +1,117 @@
+"""The section of the report on limits and alternatives: tables and figures from what notebook 06 wrote, where it was run."""
+
+from collections.abc import Callable
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from helpers import scorecard
+from helpers.artifacts import RECORD, load_stage
+from helpers.collection import DEMONSTRATIONS, Results
+from helpers.limits_figures import LABELS, budget_curves, gap_figure
+from helpers.tables import ROMAN, spread
+
+PLACES = 4  # digits after the point that count
+FIGURES = ("iae", "iae_worst", "offset", "overshoot", "settling_time_5", "total_variation", "at_bound", "harris")
+GROUPS = {"model": "model", "noise": "noise", "set_point": "set points", "time": "dead time and load"}
+RUNS = {"hot": "hot start", "scratch": "from scratch"}
+
+
+def read(results: Results, part: str, name: str) -> pd.DataFrame:
+    """One table of one part of notebook 06 for all cases and seeds, with columns case and seed; empty where none was run."""
+    frames = []
+    for (case, seed, folder), stage in results.stages.items():
+        path = stage.folder.parent / f"limits_{part}"
+        if folder == DEMONSTRATIONS and (path / RECORD).is_file():
+            table = load_stage(path, f"notebook 06 for case {case} and seed {seed}").table(name)
+            frames.append(table.assign(case=case, seed=seed))
+    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
+
+
+def tabulate(results: Results) -> dict[str, pd.DataFrame]:
+    """The tables of the section by name, as text; none where notebook 06 was not run.
+
+    Over several seeds every number is a median, with its interval from as many seeds as make one; the interval of a single
+    seed's gap is that of its Monte Carlo.
+    """
+    gaps = read(results, "attainable", "gaps.csv")
+    if gaps.empty:
+        return {}
+    budget = read(results, "budget", "curves.csv").rename(columns={"learner": "controller", "objective": "value"})
+    listed = read(results, "budget", "budget.csv").melt(["case", "seed", "learner"], var_name="metric")
+    robust = read(results, "robustness", "robustness.csv")
+    expert = robust[robust["controller"] == "expert"].drop(columns=["controller", "standard_error"])
+    paired = robust.merge(expert, on=["case", "seed", "group", "row", "column"], suffixes=("", "_expert"))
+    worst = paired.assign(value=100 * paired["objective"] / paired["objective_expert"])
+    worst = worst.groupby(["case", "seed", "controller", "group"], as_index=False)["value"].min()
+    quality = read(results, "quality", "quality.csv").rename(columns={"figure": "metric"})
+    kept = quality["metric"].str.split(":").str[0].isin(FIGURES)
+    safety = read(results, "safety", "safety.csv").melt(["case", "seed", "run"], var_name="metric")
+    return {
+        "limits_gaps": _gaps(gaps),
+        "limits_budget": _wide(listed.rename(columns={"learner": "controller"}), int, "J after {:,}", decimals=2),
+        "limits_robustness": _wide(worst.rename(columns={"group": "metric"}), str, "{}", GROUPS, decimals=0),
+        "limits_quality": _quality(quality[kept]),
+        "limits_safety": _wide(safety.rename(columns={"run": "controller"}), str, "{}", names=RUNS),
+    } | ({"limits_curves": budget} if len(budget) else {})
+
+
+def _summary(frame: pd.DataFrame) -> pd.DataFrame:
+    return scorecard.summary(frame.rename(columns={"controller": "stage"})[["case", "seed", "stage", "metric", "value"]])
+
+
+def _gaps(gaps: pd.DataFrame) -> pd.DataFrame:
+    """A row for each controller, a column for each case and beta: the gap to the programme in per cent."""
+    columns: dict[str, dict[str, str]] = {}
+    for (case, beta), rows in gaps.groupby(["case", "beta"]):
+        column = f"{ROMAN[case - 1]}, $\\beta$ = {beta:g}"
+        if len(set(rows["seed"])) == 1:
+            found = rows.rename(columns={"gap": "median", "gap_low": "ci_low", "gap_high": "ci_high"}).set_index("controller")
+        else:
+            found = _summary(rows.assign(metric="gap", value=rows["gap"])).set_index("stage")
+        columns[column] = {name: spread(found.loc[name], decimals=1) for name in LABELS if name in found.index}
+    return _labelled(pd.DataFrame(columns))
+
+
+def _wide(
+    frame: pd.DataFrame,
+    kind: Callable,
+    header: str,
+    words: dict[str, str] | None = None,
+    names: dict[str, str] | None = None,
+    decimals: int | None = None,
+) -> pd.DataFrame:
+    """Medians of long rows (case, seed, controller, metric, value): a row for each case and controller, a column a metric."""
+    found = _summary(frame.assign(value=frame["value"].round(PLACES)))  # a reward of 1e-90 is nought
+    order, rows = list(dict.fromkeys(frame["metric"])), []
+    for case in sorted(frame["case"].unique()):
+        numbers = found[found["case"] == case].set_index(["stage", "metric"])
+        for name, label in (names or LABELS).items():
+            if name in set(frame["controller"]):
+                cells = {metric: spread(numbers.reindex([(name, metric)]).iloc[0], decimals=decimals) for metric in order}
+                shown = {header.format(kind((words or {}).get(metric, metric))): cell for metric, cell in cells.items()}
+                rows.append({"case": ROMAN[case - 1], "controller": label} | shown)
+    return pd.DataFrame(rows).rename(columns=lambda column: column.replace("_", " "))
+
+
+def _quality(quality: pd.DataFrame) -> pd.DataFrame:
+    """A row for each case and controller, a column for each figure and variable."""
+    table = _wide(quality, str, "{}")
+    return table.rename(columns=lambda column: column.replace("settling time 5", "settling time"))
+
+
+def _labelled(table: pd.DataFrame) -> pd.DataFrame:
+    ordered = table.reindex([name for name in LABELS if name in table.index])
+    return ordered.rename(index=LABELS).rename_axis("controller").reset_index()
+
+
+def draw(results: Results) -> dict[str, Figure]:
+    """The figures of the section by name, for each case that notebook 06 was run for."""
+    curves, gaps = read(results, "budget", "curves.csv"), read(results, "attainable", "gaps.csv")
+    drawn = {}
+    for case in sorted(gaps["case"].unique()) if len(gaps) else ():
+        own = gaps[gaps["case"] == case].groupby(["beta", "controller"], as_index=False).median(numeric_only=True)
+        levels = own[own["beta"] == results.params[case].case.online.headline_beta].set_index("controller")["objective"]
+        drawn[f"limits_budget_case_{case}"] = budget_curves(curves[curves["case"] == case], levels)
+        drawn[f"limits_gaps_case_{case}"] = gap_figure(own)
+    return drawn

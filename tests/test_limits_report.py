@@ -1,0 +1,88 @@
+"""The section of the report on limits: what it shows is what notebook 06 wrote, and it is not there where that was not run."""
+
+from types import SimpleNamespace
+
+import pandas as pd
+import pytest
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from helpers import limits_report
+from helpers.artifacts import save_stage
+from helpers.params import load
+from helpers.sources import PROJECT
+from helpers.tables import to_markdown
+
+
+@pytest.fixture
+def results(root, tmp_path):
+    def build(seeds, written=True):
+        params = {case: load(root, case) for case in (1, 2)}
+        stages = {}
+        for case in params:
+            for seed in range(seeds):
+                folder = tmp_path / f"seed_{seed}/case_{case}"
+                stages[case, seed, "demonstrations"] = SimpleNamespace(folder=folder / "demonstrations")
+                if written:
+                    write(folder, 10.0 * case + seed)
+        return SimpleNamespace(params=params, stages=stages)
+
+    return build
+
+
+def write(folder, level):
+    """What notebook 06 writes, in small: the gap of the MPC and every other number follow from `level`."""
+    names = ["expert", "mpc", "dynamic_programme"]
+    gaps = pd.DataFrame({"beta": 30.0, "controller": names, "objective": [10.0, 19.0, 20.0], "gap": [50.0, level, 0.0]})
+    gaps = gaps.assign(gap_low=gaps["gap"] - 1, gap_high=gaps["gap"] + 1, low=0.0, high=0.0)
+    save_stage(folder / "limits_attainable", {}, {"gaps.csv": gaps})
+    curves = pd.DataFrame({"learner": ["mpc", "ppo", "ppo"], "episodes": [0, 0, 500], "objective": [19.0, 1.0, level]})
+    budget = pd.DataFrame({"learner": ["mpc", "ppo"], "0": [19.0, 1.0], "500": [19.0, level]})
+    save_stage(folder / "limits_budget", {}, {"curves.csv": curves, "budget.csv": budget})
+    quality = pd.DataFrame({"controller": "mpc", "figure": ["iae:T", "settling_time_5:T", "itae:T"], "value": [level, None, 1.0]})
+    save_stage(folder / "limits_quality", {}, {"quality.csv": quality})
+    cells = [("model", row, "1", name, value) for row in "12" for name, value in (("expert", 10.0), ("mpc", 10.0 * int(row)))]
+    robust = pd.DataFrame(cells, columns=["group", "row", "column", "controller", "objective"]).assign(standard_error=0.0)
+    save_stage(folder / "limits_robustness", {}, {"robustness.csv": robust})
+    safety = pd.DataFrame({"run": ["hot", "scratch"], "worst": [level, 0.0], "worse": [0.5, 1.0]})
+    save_stage(folder / "limits_safety", {}, {"safety.csv": safety})
+
+
+def test_nothing_where_it_was_not_run(results):
+    assert limits_report.tabulate(results(1, written=False)) == {}
+    assert limits_report.draw(results(1, written=False)) == {}
+
+
+def test_one_seed_shows_its_monte_carlo_interval(results):
+    found = limits_report.tabulate(results(1))
+    gaps = found["limits_gaps"].set_index("controller")
+    assert gaps.loc["offset-free MPC"].tolist() == ["10.0 [9.0, 11.0]", "20.0 [19.0, 21.0]"]
+    budget = found["limits_budget"].set_index(["case", "controller"])
+    assert budget.loc[("II", "PPO from scratch")].tolist() == ["1.00", "20.00"]
+    worst = found["limits_robustness"].set_index(["case", "controller"])["model"]
+    assert (worst["I", "offset-free MPC"], worst["I", "PID (demonstrator)"]) == ("100", "100")
+    quality = found["limits_quality"].iloc[0]
+    assert (quality["iae:T"], quality["settling time:T"]) == ("10.0", "–")
+    assert "itae:T" not in quality
+    assert found["limits_safety"].set_index(["case", "controller"]).loc[("I", "hot start"), "worst"] == "10.0"
+
+
+def test_several_seeds_show_medians(results):
+    found = limits_report.tabulate(results(3))
+    assert found["limits_gaps"].set_index("controller").loc["offset-free MPC"].tolist() == ["11.0", "21.0"]
+    figures = limits_report.draw(results(3))
+    assert set(figures) == {f"limits_{name}_case_{case}" for name in ("budget", "gaps") for case in (1, 2)}
+    line = next(line for line in figures["limits_budget_case_1"].axes[0].lines if line.get_label() == "PPO from scratch")
+    assert line.get_ydata().tolist() == [1.0, 11.0]
+
+
+def test_the_section_of_the_template(results):
+    text = (PROJECT / "reports/template/report.md.jinja").read_text(encoding="utf-8")
+    start = text.index("{% if tables.limits_gaps is defined %}")
+    section = text[start : text.index("{% if benchmarks %}", start)]
+    environment = Environment(loader=FileSystemLoader("."), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters |= {"table": to_markdown, "numeral": lambda case: "I" * case}
+    run = results(1)
+    rendered = environment.from_string(section).render(tables=limits_report.tabulate(run), cases=run.params, n_seeds=1)
+    assert "10.0 [9.0, 11.0]" in rendered
+    assert "figures/limits_budget_case_2.svg" in rendered
+    assert environment.from_string(section).render(tables={}, cases=run.params, n_seeds=1).strip() == ""

@@ -1,5 +1,7 @@
 """From a historian file to a controller, for any number of controlled and manipulated variables, without a change of code."""
 
+import re
+import shlex
 import shutil
 from dataclasses import replace
 
@@ -11,6 +13,8 @@ from plants import HORIZON, MadeUpPlant
 from helpers import own_plant, plant_report
 from helpers.deployment import DeployedPolicy
 from helpers.params import ParameterError
+from helpers.plant_description import load_description
+from helpers.sources import PROJECT
 
 
 def small(plant):
@@ -124,3 +128,28 @@ def test_what_cannot_be_used_is_one_sentence_and_a_status(tmp_path, quick_root, 
     path.write_text(path.read_text(encoding="utf-8").replace("time_unit: s", "time_unit: week"), encoding="utf-8")
     assert plant_report.main([str(path), "--scale", "smoke"]) == 2
     assert "key 'time_unit'" in capsys.readouterr().err
+
+
+def blocks(language):
+    """The blocks of README's section on one's own plant that are in this language."""
+    section = (PROJECT / "README.md").read_text(encoding="utf-8").split("## Your own plant")[1].split("\n## ")[0]
+    return re.findall(rf"```{language}\n(.*?)```", section, re.DOTALL)
+
+
+def test_readme_s_description_is_one(tmp_path):
+    (yaml,) = blocks("yaml")
+    (tmp_path / "plant.yaml").write_text(yaml, encoding="utf-8")
+    assert load_description(tmp_path / "plant.yaml").columns == ("TIME", "MODE", "TC1.PV", "TC1.OP", "TC1.SP")
+
+
+def test_readme_s_command_and_loop_run_as_they_stand(tmp_path, quick_root, monkeypatch):
+    (shell,), (python,) = blocks("sh"), blocks("python")
+    words = shlex.split(shell, comments=True)
+    assert words[:3] == [".venv/bin/python", "-m", "helpers.plant_report"]
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "notebooks").symlink_to(PROJECT / "notebooks")
+    assert plant_report.main([*words[3:], "--params", str(quick_root)]) == 0
+    namespace = {}
+    exec(python, namespace)
+    assert namespace["inputs"] == pytest.approx([24.0, 410.0])  # without a jump from what the operator applied
+    assert namespace["guard"].mode == "policy"

@@ -15,7 +15,7 @@ from helpers.sources import PROJECT
 
 NOTEBOOKS = sorted(path.stem for path in (PROJECT / "notebooks").glob("[0-9]*.ipynb"))
 OFFLINE, REPORT = "02_offline_irl", "05_report"
-OF_ALL_CASES = {REPORT: ("seeds",), "00_inferred_settings": ("seed",)}
+OF_ALL_CASES = {REPORT: ("seeds",), "00_inferred_settings": ("seed",), "07_your_own_process": ("seed",)}
 
 
 def defaults(notebook):

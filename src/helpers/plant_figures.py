@@ -3,12 +3,13 @@
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from statsmodels.tsa.stattools import acf
 
 from helpers.data_quality import CleanRecords
-from helpers.figures import COLOURS, INK, LINE_STYLES, MUTED, SET_POINT, WIDTH, empty_figure
+from helpers.figures import COLOURS, INK, LINE_STYLES, SET_POINT, WIDTH, empty_figure
 from helpers.params import DEVIATION
 from helpers.plant_description import PlantDescription, Variable
 from helpers.system_identification import Validation
@@ -56,8 +57,8 @@ def quality_figure(clean: CleanRecords, description: PlantDescription, first: in
     axes[-1].set_xlabel("sample")
     axes[-1].set_xlim(sample[0], sample[-1])
     axes[-1].xaxis.set_major_locator(MaxNLocator(8, integer=True))
-    handles = [Patch(color=LEFT_OUT, label="left out"), Patch(color=BY_HAND, label="not in automatic")]
-    handles += [line for line in axes[0].lines if line.get_label() == getattr(variables[0], "set_point_tag", None)]
+    handles: list[Patch | Line2D] = [Patch(color=LEFT_OUT, label="left out"), Patch(color=BY_HAND, label="not in automatic")]
+    handles.append(Line2D([], [], color=SET_POINT, linestyle=LINE_STYLES["set point"], label="set point"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     return figure
 
@@ -130,7 +131,14 @@ def guard_figure(steps: pd.DataFrame, description: PlantDescription) -> Figure:
         style = "default" if controlled else "steps-post"
         axis.plot(sample, steps[variable.name], color=colour, drawstyle=style, label=variable.name)
         if controlled:
-            axis.plot(sample, steps[f"{variable.name}_sp"], color=SET_POINT, linestyle=LINE_STYLES["set point"], label="set point")
+            axis.plot(
+                sample,
+                steps[f"{variable.name}_sp"],
+                color=SET_POINT,
+                linestyle=LINE_STYLES["set point"],
+                drawstyle="steps-post",
+                label="set point",
+            )
         low, high = axis.get_ylim()
         for mode, shade in MODE_COLOURS.items():
             here = steps["mode"].eq(mode)

@@ -25,6 +25,7 @@ from benchmarks.subjects import (
     OURS,
     PRODUCT,
     PROJECT,
+    SIDE_BY_SIDE,
     Subject,
 )
 from helpers.artifacts import code_revision
@@ -172,6 +173,8 @@ def summary(
         f"{rows} × {inner} by {inner} × {width} ({gflops[0]:.0f} GFLOP/s with one thread, {gflops[1]:.0f} with two) over the "
         f"{flops:,} operations of one learnt step: {FORWARD_PASSES} forward passes of the network, of which the rollout is one, "
         "the learning pass one and its gradient two. It leaves out noise, process, features, gate functions and optimiser.",
+        "Two seeds side by side, each in a process of one thread, as Snakemake runs them, learn together from "
+        f"{best[SIDE_BY_SIDE]:,.0f} steps a second, {best[BOUND] / best[SIDE_BY_SIDE]:.2f} times as long a step as the bound.",
         to_markdown(compared[[*COLUMNS[:9]]], digits=3),
         "Time and memory of an epoch as powers of its size:",
         to_markdown(fits[["quantity", "against", "threads", "exponent"]], digits=3),

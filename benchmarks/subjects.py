@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from benchmarks.one_at_a_time import OneAtATime
+from benchmarks.side_by_side import PROCESSES, SideBySide
 from helpers.features import FeatureMap
 from helpers.maxent_irl import apprentice_reward, initial_weights
 from helpers.params import LearnerParams, Params, load
@@ -23,6 +24,7 @@ from helpers.task import ControlTask
 
 PROJECT = Path(__file__).resolve().parents[1]
 OURS, OURS_AS_SET, ONE_AT_A_TIME = "ours", "ours, with the minibatches of the improved variant", "one episode at a time"
+SIDE_BY_SIDE = "ours, two seeds side by side"  # `threads` of its row counts the processes
 BOUND, GATES = "bound: small-matrix products", "gate functions alone"
 LIBRARY = "RecurrentPPO, {environments} environment(s), {passes} gradient pass(es)"
 LIBRARY_SIZES = ((1, 1), (1, 10), (32, 1), (32, 10))  # environments, gradient passes; 10 is the library's default
@@ -126,6 +128,10 @@ class Workload:
         improved = self.params.learning.variants["improved"].learner
         return Subject(OURS_AS_SET, threads, K, T, epochs * K * T, repeated(self.epoch(K, T, improved), epochs))
 
+    def side_by_side(self, K: int, T: int, epochs: int) -> Subject:
+        """The same in two processes at once, each with a seed of its own."""
+        return Subject(SIDE_BY_SIDE, PROCESSES, K, T, PROCESSES * epochs * K * T, SideBySide(K, T, epochs))
+
     def one_at_a_time(self, episodes: int, T: int) -> Subject:
         """The usual research style. Its cost is proportional to the episodes, so a few of them tell it."""
         policy, process, features, reward = self.parts(T)
@@ -185,6 +191,7 @@ def library_installed() -> bool:
 def comparison(workload: Workload, size: Size) -> list[Subject]:
     """The subjects that are set side by side at one K and T."""
     subjects = [workload.ours(threads, size.K, size.T, size.epochs) for threads in (1, 2)]
+    subjects.append(workload.side_by_side(size.K, size.T, size.epochs))
     subjects += [workload.ours_as_set(threads, size.K, size.T, size.epochs) for threads in (1, 2)]
     subjects += [workload.bound(threads, size.products) for threads in (1, 2)]
     subjects += [workload.gates(threads, size.products) for threads in (1, 2)]

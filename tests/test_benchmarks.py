@@ -205,7 +205,8 @@ def test_a_quick_run_writes_everything(written):
     rows = set(compared[["what", "threads"]].itertuples(index=False, name=None))
     for what in (subjects.OURS, subjects.OURS_AS_SET, subjects.BOUND, subjects.GATES):
         assert {(what, 1), (what, 2)} <= rows
-    assert len(compared) == 9 + 4 * subjects.library_installed()
+    assert (subjects.SIDE_BY_SIDE, 2) in rows
+    assert len(compared) == 10 + 4 * subjects.library_installed()
     assert len(frame) - len(compared) == len(subjects.scaling_sizes(size))
     assert (frame[["steps_per_s", "ratio_to_bound", "seconds_min"]] > 0).all(axis=None)
     assert frame["seconds"].between(frame["seconds_min"], frame["seconds_max"]).all()

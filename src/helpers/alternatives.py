@@ -10,7 +10,7 @@ from helpers import stages
 from helpers.cloning import clone
 from helpers.controllers import Controller, Operator
 from helpers.evaluation import feature_gap, objective
-from helpers.experiments import Prepared, Scores, copied, gap_to, mode, predictive, varied
+from helpers.experiments import Prepared, Scores, copied, economical, gap_to, mode, predictive, varied
 from helpers.features import FeatureMap
 from helpers.maxent_irl import initial_weights, maxent_irl
 from helpers.policy import LSTMPolicy
@@ -89,7 +89,7 @@ def demonstrators(prepared: Prepared) -> Scores:
 def _learned_from(prepared: Prepared, data: stages.Demonstrations) -> tuple[LSTMPolicy, dict[str, float]]:
     """The policy that Algorithm 2 learns from such data; its gap to them, and the tracking objective of both."""
     session = prepared.session
-    short = varied(session, offline={"epochs": prepared.params.demonstrators.epochs})
+    short = economical(varied(session, offline={"epochs": prepared.params.demonstrators.epochs}))
     learned = stages.imitate(short, data, stages.fresh_policy(session)).policy
     fresh = mode(session, learned)
     return learned, {
@@ -125,7 +125,7 @@ def _from_rest(prepared: Prepared) -> Scores:
     at_rest = varied(
         session, case={"initial_mean": session.params.case.set_point, "initial_std": spread}, offline={"epochs": params.epochs}
     )
-    learned = stages.imitate(at_rest, record(at_rest, at_rest.expert, "at rest"), stages.fresh_policy(session)).policy
+    learned = stages.imitate(economical(at_rest), record(at_rest, at_rest.expert, "at rest"), stages.fresh_policy(session)).policy
     fresh = mode(session, learned)
     objective_x = stages.judge(session, fresh)["objective_x"]
     return {"from_rest": {"gap": gap_to(session, fresh, prepared.expert_features), "objective_x": objective_x}}
@@ -195,7 +195,7 @@ def robustness(prepared: Prepared) -> Scores:
     for number in params.cloning.demonstrations:
         policies[f"clone_{number}"] = cloned(prepared, first(prepared.demonstrations, number).trajectories)
     if prepared.planned(params.fewer_demonstrations):
-        short = varied(session, offline={"epochs": params.fewer_demonstrations.epochs})
+        short = economical(varied(session, offline={"epochs": params.fewer_demonstrations.epochs}))
         for number in params.fewer_demonstrations.demonstrations:
             fewer = first(prepared.demonstrations, number)
             policies[f"irl_{number}"] = stages.imitate(short, fewer, stages.fresh_policy(session)).policy

@@ -36,6 +36,10 @@ from helpers.trajectories import Trajectories
 
 Scores = dict[str, dict[str, float]]  # run, metric, value
 
+# Share of the episodes of an epoch, in the learning that only a claim reads. In Case I, seed 0, the gap to the predictive
+# controller was 5.1 % with it and 4.1 % without, to the operator 2.0 and 1.9 %, from data at rest 25 and 26 %.
+ECONOMY = 3 / 8
+
 
 @dataclass(frozen=True)
 class Prepared:
@@ -98,6 +102,13 @@ def varied(session: Session, **changes: Mapping[str, Any]) -> Session:
             features=params.features.model_copy(update=dict(changes.get("features", {}))),
         ),
     )
+
+
+def economical(session: Session) -> Session:
+    """The session with fewer episodes an epoch, learned from and measured, for runs that nothing but a claim reads."""
+    scale = session.scale_params
+    fewer = {name: max(2, round(ECONOMY * getattr(scale, name))) for name in ("episodes", "measured")}
+    return replace(session, scale_params=scale.model_copy(update=fewer))
 
 
 def mode(session: Session, policy: LSTMPolicy) -> Trajectories:
@@ -304,7 +315,7 @@ def learn_under(session: Session, weights: Tensor, n_epochs: int, label: str) ->
     generator, params, n_episodes = (
         session.stream("experiments", "frozen"),
         session.variant_params.learner,
-        session.scale_params.episodes,
+        economical(session).scale_params.episodes,
     )
     policy = stages.fresh_policy(session)
     learner = Learner(policy, session.process, session.features, params, n_episodes, n_epochs, generator)

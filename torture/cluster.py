@@ -22,6 +22,7 @@ from torture.runs import Place
 
 PACKAGES = ("slurmctld", "slurmd", "slurm-client", "munge")
 PROFILE = "profiles/slurm/without_accounting"
+SYSTEM = Path("/etc/slurm/slurm.conf")  # where commands inside a job look: the plugin takes SLURM_CONF out of its environment
 PATIENCE = 120.0  # seconds for the node to come up
 CONFIGURATION = """\
 ClusterName=loopback
@@ -77,8 +78,10 @@ def one_node(folder: Path) -> Iterator[dict[str, str]]:
     """A SLURM of one node on loopback while the context lasts; gives the environment in which its commands find it.
 
     Raises:
-        SkipError: if it does not come up.
+        SkipError: if the machine has a SLURM of its own, or this one does not come up.
     """
+    if SYSTEM.exists():
+        raise SkipError(f"{SYSTEM} exists: this machine has a SLURM of its own, use it with a profile of profiles/slurm")
     host, memory = socket.gethostname().split(".")[0], os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20
     for name in ("state", "spool"):
         (folder / name).mkdir()
@@ -104,12 +107,16 @@ def one_node(folder: Path) -> Iterator[dict[str, str]]:
     started: list[subprocess.Popen[bytes]] = []
     with (folder / "daemons.log").open("wb") as log:
         try:
+            SYSTEM.parent.mkdir(exist_ok=True)
+            SYSTEM.unlink(missing_ok=True)  # a link that a killed run left
+            SYSTEM.symlink_to(configuration)
             for command in commands:
                 started.append(subprocess.Popen(command, env={**os.environ, **environment}, stdout=log, stderr=subprocess.STDOUT))
                 time.sleep(1.0)
             _wait_until_idle(environment, folder)
             yield environment
         finally:
+            SYSTEM.unlink(missing_ok=True)
             for process in reversed(started):
                 process.terminate()
                 try:

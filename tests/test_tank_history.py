@@ -2,7 +2,6 @@
 
 import pandas as pd
 import pytest
-import torch
 
 from helpers.nonlinear_tank import example, load_tank
 from helpers.params import load
@@ -10,7 +9,7 @@ from helpers.plant_data import read_records
 from helpers.plant_description import load_description
 from helpers.randomness import stream
 from helpers.sources import PROJECT
-from helpers.tank_history import AUTOMATIC, BAD, FILE, MANUAL, Plan, pi_gains, record, spoil
+from helpers.tank_history import AUTOMATIC, BAD, FILE, MANUAL, Plan, record, spoil
 
 
 @pytest.fixture(scope="module")
@@ -18,9 +17,8 @@ def recorded(root):
     """A plan of two set point steps, and what is recorded under it."""
     params = load(root, 1)
     settings = load_tank(root, params.process)[1].history.model_copy(update={"cycles": 2, "other_every": 2})
-    low, high = (torch.tensor(bound, dtype=torch.float64) for bound in (params.process.input_low, params.process.input_high))
-    plan = Plan.draw(settings, params.case.set_point, high - low, stream(0, "plan"))
-    table = record(example(), pi_gains(params.demonstrator), plan, low, high, stream(0, "record"))
+    plan = Plan.draw(settings, params.case.set_point, stream(0, "plan"))
+    table = record(example(), settings, plan, stream(0, "record"))
     return settings, plan, table
 
 

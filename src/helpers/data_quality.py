@@ -186,7 +186,7 @@ def _fill(tag: str, values: Array, breaks: Mask, row: NDArray, params: QualityPa
     missing = np.isnan(values)
     if not missing.any():
         return np.ones(len(values), dtype=bool)
-    short = missing & ~_long_runs(missing | (np.roll(missing, -1) & np.roll(breaks, -1)), params.longest_repair + 1)
+    short = missing & ~_long_runs(missing, params.longest_repair + 1)
     known = np.flatnonzero(~missing)
     inner = short & (np.arange(len(values)) > known[0]) & (np.arange(len(values)) < known[-1])
     places = np.flatnonzero(inner)

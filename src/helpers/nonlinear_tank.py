@@ -38,6 +38,10 @@ Array = NDArray[np.float64]
 class HistoryParams(Record):
     """What the historian file of the tank records."""
 
+    proportional: Annotated[Vector, Leaf("input/output")]
+    integral: Annotated[Vector, Leaf("input/(output time)")]
+    input_low: Annotated[Vector, Leaf("deviation of mol/L and K")]
+    input_high: Annotated[Vector, Leaf("deviation of mol/L and K")]
     cycles: Annotated[Count, Leaf("set point steps")]
     hold: Annotated[Count, Leaf("samples")]
     rest: Annotated[Count, Leaf("samples")]
@@ -150,7 +154,9 @@ def load_tank(root: Path, process: ProcessParams) -> tuple[NonlinearTank, TankPa
     """The tank of params/nonlinear_tank.yaml with the groups of the process."""
     path = root / "nonlinear_tank.yaml"
     params = validate(TankParams, read_yaml(path), path)
-    for name, value in (("sensor_noise", params.sensor_noise), ("history.other_set_point", params.history.other_set_point)):
+    own = ("proportional", "integral", "input_low", "input_high", "other_set_point")
+    vectors = {"sensor_noise": params.sensor_noise} | {f"history.{name}": getattr(params.history, name) for name in own}
+    for name, value in vectors.items():
         if len(value) != len(process.controlled):
             raise ParameterError(f"{path}: key '{name}': expected {len(process.controlled)} entries, found {len(value)}")
     return NonlinearTank(process, params, root / "process.yaml"), params

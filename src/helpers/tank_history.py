@@ -18,7 +18,6 @@ from helpers.nonlinear_tank import HistoryParams, NonlinearTank, load_tank
 from helpers.params import GainParams, Params, load
 from helpers.randomness import stream
 from helpers.sources import PROJECT
-from helpers.task import ControlTask
 
 FILE = PROJECT / "notebooks/plant/tank.csv"
 LOOPS = ("AC101", "TC101")  # the tags of the loops: .PV what is measured, .SP the set point, .OP the input
@@ -26,14 +25,11 @@ START = pd.Timestamp("2026-01-05")
 AUTOMATIC, MANUAL, BAD = "AUTO", "MAN", "Bad"
 
 
-def pi_gains(gains: GainParams) -> GainParams:
-    """The same gains without the derivative part."""
-    return gains.model_copy(update={"derivative": (0.0,) * len(gains.proportional)})
-
-
-def pi_controller(params: Params, task: ControlTask) -> PID:
-    """The PI that wrote the file, for a task of the tank."""
-    return PID(pi_gains(params.demonstrator), task.set_point, params.process.sampling_time)
+def pi_controller(params: HistoryParams, task_set_point: Tensor, sampling_time: float) -> PID:
+    """The PI that wrote the file, for a set point in deviation variables."""
+    none = (0.0,) * len(params.proportional)
+    gains = GainParams.model_construct(proportional=params.proportional, integral=params.integral, derivative=none)
+    return PID(gains, task_set_point, sampling_time)
 
 
 @dataclass(frozen=True)
@@ -45,8 +41,9 @@ class Plan:
     drift: Tensor
 
     @classmethod
-    def draw(cls, params: HistoryParams, set_point: Sequence[float], span: Tensor, generator: torch.Generator) -> "Plan":
-        """Rest and set point step in turn; by hand, an input moves about where it was; `span` is the range of the inputs."""
+    def draw(cls, params: HistoryParams, set_point: Sequence[float], generator: torch.Generator) -> "Plan":
+        """Rest and set point step in turn; by hand, an input moves about where it was."""
+        span = torch.tensor(params.input_high, dtype=torch.float64) - torch.tensor(params.input_low, dtype=torch.float64)
         block = params.rest + params.hold
         n_samples = block * params.cycles
         targets = torch.zeros(n_samples, len(set_point), dtype=torch.float64)
@@ -68,9 +65,7 @@ class Plan:
         return cls(targets, by_hand, drift)
 
 
-def record(
-    tank: NonlinearTank, gains: GainParams, plan: Plan, low: Tensor, high: Tensor, generator: torch.Generator
-) -> pd.DataFrame:
+def record(tank: NonlinearTank, params: HistoryParams, plan: Plan, generator: torch.Generator) -> pd.DataFrame:
     """Run the plan under PI control; a row for each sample, engineering units.
 
     By hand an input is where the PI left it plus the operator's move. On return to automatic the integral is set so that the
@@ -80,7 +75,8 @@ def record(
     noise = torch.randn(n_samples, 2, 1, tank.n_states, generator=generator, dtype=torch.float64)
     steady_y, steady_u = torch.tensor(tank.steady.controlled), torch.tensor(tank.steady.manipulated)
     x = torch.zeros(1, tank.n_states, dtype=torch.float64)
-    pid = PID(gains, plan.set_point[0], tank.sampling_time)
+    low, high = (torch.tensor(bound, dtype=torch.float64) for bound in (params.input_low, params.input_high))
+    pid = pi_controller(params, plan.set_point[0], tank.sampling_time)
     memory = pid.start(1, n_samples, generator)
     u = held = torch.zeros(1, tank.n_inputs, dtype=torch.float64)
     rows: list[Tensor] = []
@@ -144,11 +140,11 @@ def spoil(table: pd.DataFrame, n_faults: int, seed: int) -> pd.DataFrame:
 def make_history(params: Params, seed: int = 0) -> pd.DataFrame:
     """The whole historian file of the tank, as text."""
     tank, tank_params = load_tank(PROJECT / "params", params.process)
+    history = tank_params.history
     generator = stream(seed, "tank history")
-    low, high = (torch.tensor(bound, dtype=torch.float64) for bound in (params.process.input_low, params.process.input_high))
-    plan = Plan.draw(tank_params.history, params.case.set_point, high - low, generator)
-    table = record(tank, pi_gains(params.demonstrator), plan, low, high, generator)
-    return spoil(table, tank_params.history.faults, seed)
+    plan = Plan.draw(history, params.case.set_point, generator)
+    table = record(tank, history, plan, generator)
+    return spoil(table, history.faults, seed)
 
 
 def main() -> int:

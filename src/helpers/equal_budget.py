@@ -150,7 +150,7 @@ def retuned(contest: Contest) -> Learned:
             costs.append(-contest.returns(batch).mean().item())
         search.tell(points, costs)
         before, spent = spent, spent + params.episodes * len(points)
-        mean = np.maximum(search.mean, 0)
+        mean = np.asarray(search.result.xfavorite)
         if before // contest.scale.every < spent // contest.scale.every:
             visitor(spent, pid(gains(mean), session))
     return Learned(partial(pid, gains(mean)), visitor.curve)

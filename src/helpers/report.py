@@ -15,7 +15,7 @@ import pypandoc
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from helpers import drawings, figures, scorecard, statistics, tables
+from helpers import drawings, figures, limits_report, scorecard, statistics, tables
 from helpers.artifacts import ArtifactError, code_revision
 from helpers.collection import ONLINE, Results
 from helpers.identity import digest, versions
@@ -68,6 +68,7 @@ def draw(results: Results) -> dict[str, Figure]:
             levels[case] = {label: results.median(case, stage, "objective_x") for label, stage in stages.items()}
         titles = {case: f"Case Study {tables.ROMAN[case - 1]}" for case in results.params}
         drawn["online_budget"] = figures.budget_figure(results.budget, levels, titles)
+    drawn |= limits_report.draw(results)
     return {f"figure_{OF_THE_PAPER[name]}" if name in OF_THE_PAPER else name: figure for name, figure in drawn.items()}
 
 
@@ -112,7 +113,7 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     if results.inferred is not None:
         for name in ("settings", "hypotheses", "prediction"):
             tabulated[f"inferred_{name}"] = results.inferred.table(f"{name}.csv")
-    return tabulated
+    return tabulated | limits_report.tabulate(results)
 
 
 def provenance(results: Results) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 # The order of the stages for each case and seed. Every stage is one notebook, executed by helpers.run.
 # Settings (snakemake --config name=value): seeds (how many), scale (smoke or paper), results, reports (folders),
-# evidence=1 for the runs beyond the paper's own (the claims, the trials of offline learning and the inferred settings), and
+# evidence=1 for the runs beyond the paper's own (claims, limits, trials of offline learning, inferred settings), and
 # missing=1 for a report of the seeds whose stages are all there.
 #
 # A result says in its record.json what it was made from. Where that is otherwise now, the file CHANGED is among the inputs of
@@ -195,7 +195,7 @@ rule claims:
 
 rule limits:
     input:
-        sources("06_limits_and_alternatives", "experiments", "limits"),
+        made_from("06_limits_and_alternatives", f"{CASE}/limits_safety/record.json"),
         demonstrations=f"{CASE}/demonstrations/record.json",
         offline=f"{CASE}/offline_improved/record.json",
         transfer=lambda wildcards: [f"{CASE}/transfer_improved/record.json"] if wildcards.case == "3" else [],

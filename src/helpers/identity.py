@@ -26,6 +26,7 @@ OF_ALL_CASES = ("00_inferred_settings", "05_report")
 MORE_FILES = {
     "00_inferred_settings": ("identification", "published"),
     "05_report": ("published", "claims", "trials"),
+    "06_limits_and_alternatives": ("experiments", "limits"),
     "08_claims": ("experiments", "published"),
 }
 NOT_OF_RESULTS = ("checkpoint_interval",)  # settings that cannot change a number

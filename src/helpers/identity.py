@@ -27,6 +27,7 @@ MORE_FILES = {
     "00_inferred_settings": ("identification", "published"),
     "05_report": ("published", "claims", "trials"),
     "06_limits_and_alternatives": ("experiments", "limits"),
+    "07_your_own_process": ("nonlinear_tank", "own_plant"),
     "08_claims": ("experiments", "published"),
 }
 NOT_OF_RESULTS = ("checkpoint_interval",)  # settings that cannot change a number

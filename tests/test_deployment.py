@@ -1,6 +1,5 @@
 """A policy as a file: it does what torch does over whole episodes, in engineering units, within the bounds, quickly."""
 
-import time
 
 import numpy as np
 import pytest
@@ -70,17 +69,6 @@ def test_the_inputs_stay_within_the_bounds(deployed):
         u = file.step((steady_y + size)[None].numpy(), steady_y[None].numpy(), steady_u[None].numpy())
         assert (u >= (task.input_low + steady_u).numpy() - 1e-9).all()
         assert (u <= (task.input_high + steady_u).numpy() + 1e-9).all()
-
-
-def test_a_step_takes_well_under_a_millisecond(deployed):
-    _, file, _, (steady_y, steady_u) = deployed
-    y, u = steady_y[None].numpy(), steady_u[None].numpy()
-    times = []
-    for _ in range(300):
-        begin = time.perf_counter()
-        file.step(y, y, u)
-        times.append(time.perf_counter() - begin)
-    assert np.median(times) < 1e-3
 
 
 def test_the_file_tells_about_itself_and_another_file_is_refused(deployed, tmp_path):

@@ -1,7 +1,5 @@
 """A policy as a file: it does what torch does over whole episodes, in engineering units, within the bounds, quickly."""
 
-
-import numpy as np
 import pytest
 import torch
 from plants import MadeUpPlant

@@ -8,6 +8,7 @@ local run to the last bit, and stops what it started. Packages stay installed.
 import argparse
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -178,6 +179,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     names = range(given.seeds) if given.case else ()
     targets = [f"results/smoke/seed_{seed}/case_{given.case}/offline_improved/record.json" for seed in names]
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # stopped from outside, it stops what it started all the same
     try:
         install()
         with tempfile.TemporaryDirectory(prefix="slurm") as name:

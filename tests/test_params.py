@@ -1,5 +1,6 @@
 """Parameter files: what the committed ones hold, and that every mistake is one sentence naming the file and the key."""
 
+import copy
 import shutil
 
 import pytest
@@ -29,7 +30,7 @@ def edit(path, changes):
         if value is DELETE:
             del entry[last]
         else:
-            entry[last] = value
+            entry[last] = copy.deepcopy(value)  # else YAML would write an alias for what stands twice
     yaml.dump(content, path)
 
 

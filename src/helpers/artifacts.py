@@ -102,7 +102,7 @@ def save_stage(
     """
     folder = folder.resolve()
     for name in (*(tables or {}), *(figures or {}), *(texts or {})):
-        if Path(name).name != name:
+        if Path(name).name != name or name == "..":
             raise ArtifactError(f"{folder}: the file name '{name}' leads out of the stage's folder")
     partial = beside(folder)
     try:

@@ -65,7 +65,7 @@ def export(policy: LSTMPolicy, task: ControlTask, steady_y: Tensor, steady_u: Te
     Args:
         steady_y, steady_u: the steady state in engineering units, (n_y,) and (n_u,).
     """
-    module = PolicyStep(policy, task, steady_y, steady_u).eval()
+    module = PolicyStep(policy, task, steady_y, steady_u).train(False)
     names = state_names(policy)
     states = [torch.zeros(1, 1, layer.hidden_size) for layer in policy.lstms for _ in ("h", "c")]
     example = (steady_y.double()[None], steady_y.double()[None], steady_u.double()[None], *states)

@@ -72,8 +72,11 @@ def execute(notebook: str, output: Path, parameters: dict[str, Any]) -> None:
             )
         finally:
             if partial.exists():
-                strip_machine(partial)
-                partial.replace(output)
+                try:
+                    strip_machine(partial)
+                    partial.replace(output)
+                except nbformat.reader.NotJSONError:  # half-written, because the disk is full: what went wrong is on its way
+                    partial.unlink()
 
 
 def _forget_dead_sockets() -> None:

@@ -45,7 +45,7 @@ test: setup  ## style, types, layers, tests and the notebooks against their stor
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest --nbval notebooks tests
+	$(BIN)/python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder --nbval notebooks tests
 
 lab: setup  ## open JupyterLab on the notebooks
 	$(BIN)/python -m jupyter lab notebooks

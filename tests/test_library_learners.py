@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from helpers.features import tracking_reward  # noqa: E402
 from helpers.gym_environment import TrackingEnv  # noqa: E402
-from helpers.library_learners import LibraryController, learn, library_learner  # noqa: E402
+from helpers.library_learners import LibraryController, TrackingEnvs, learn, library_learner  # noqa: E402
 from helpers.limits_params import load_limits  # noqa: E402
 from helpers.randomness import stream  # noqa: E402
 from helpers.rollout import rollout  # noqa: E402
@@ -51,6 +51,28 @@ def test_an_episode_is_that_of_the_process(make):
         error = (case.task.set_point - x) / case.task.error_scale
         assert reward == pytest.approx(tracking_reward(error, 10.0).item(), abs=1e-12)
         assert (over, cut) == (t == case.task.n_steps - 1, False)
+
+
+def test_episodes_side_by_side_are_single_ones(make):
+    """Without noise after the start: each episode of the batch is the single environment's from the same state."""
+    _, env = make(disturbance=(0.0, 0.0), observation_noise=(0.0, 0.0))
+    batch = TrackingEnvs(make(disturbance=(0.0, 0.0), observation_noise=(0.0, 0.0))[1], 3)
+    batch.seed(5)
+    first = batch.reset()
+    starts = batch.env.x.copy()
+    actions = np.random.default_rng(0).uniform(-1.5, 1.5, (env.n_steps, 3, 2))
+    seen, rewards, ends, infos = zip(*(batch.step(action) for action in actions), strict=True)
+    for k in range(3):
+        env.reset(seed=0)
+        env.x = starts[k]
+        for t, action in enumerate(actions[:, k]):
+            expected, reward, over, _, _ = env.step(action)
+            assert rewards[t][k] == pytest.approx(reward, abs=1e-12)
+            assert ends[t][k] == over
+            assert (infos[t][k]["terminal_observation"] if over else seen[t][k]) == pytest.approx(expected, abs=1e-6)
+    assert not np.allclose(seen[-1], first)  # the next episodes have begun, from other states
+    batch.seed(5)
+    assert np.array_equal(batch.reset(), first)
 
 
 @pytest.mark.parametrize("name", ["ppo", "recurrent_ppo"])

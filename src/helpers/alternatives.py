@@ -35,7 +35,7 @@ class SomeFeatures(FeatureMap):
 
 
 def feature_sets(prepared: Prepared) -> Scores:
-    """Algorithm 2 with the Type I features alone (type_one), beside the run with all (all_types).
+    """Algorithm 2 with the Type I features alone (type_one) and with all (all_types), alike in everything else.
 
     own_gap: the gap in the features that were matched; gap: in all six; distance: between the mean responses of policy and
     expert, root mean square over time and loops, as a share of the set point change; then the outcome of improving each online
@@ -44,31 +44,33 @@ def feature_sets(prepared: Prepared) -> Scores:
     session, params = prepared.session, prepared.params
     if not prepared.planned(params.feature_sets):
         return {}
-    kept = tuple(range(len(session.task.set_point)))
-    chosen = SomeFeatures(**vars(session.features), kept=kept)
-    variant, scale = session.variant_params, session.scale_params
-    n_epochs = session.epochs(session.params.case.offline.epochs)
-    policy, generator = stages.fresh_policy(session), session.stream("offline", "improved")
-    learner = Learner(policy, session.process, chosen, variant.learner, scale.episodes, n_epochs, generator)
-    start = initial_weights(variant.weights, len(kept), session.dtype)[: len(kept)]
-    known = prepared.demonstrations.features(chosen)
-    bar, memory = ProgressBar(n_epochs, "Type I alone"), stages.memory(session, learner, known, start)
-    learned = maxent_irl(learner, known, start, variant.weights, n_epochs, scale.measured, bar, memory)
+    short = economical(varied(session, offline={"epochs": params.feature_sets.epochs}))
     expert = session.features.errors(stages.fresh_trajectories(session, session.expert)).mean(1)
-    scores = {}
-    started = stages.improve(session, copied(session, learned.policy), "x").policy
-    every = list(range(len(session.feature_names)))
-    runs = {"type_one": (learned.policy, started, list(kept)), "all_types": (prepared.imitator, prepared.improved, every)}
-    for name, (policy, improved, columns) in runs.items():
-        fresh = mode(session, policy)
-        v, truth = session.features.trajectory(fresh).mean(0).double(), prepared.expert_features
+    truth, scores = prepared.expert_features, Scores()
+    everything = tuple(range(len(truth)))
+    for name, kept in (("type_one", everything[: len(session.task.set_point)]), ("all_types", everything)):
+        policy = _matching(prepared, short, kept)
+        fresh, improved = mode(session, policy), stages.improve(session, copied(session, policy), "x").policy
+        v = session.features.trajectory(fresh).mean(0).double()
         scores[name] = {
-            "own_gap": feature_gap(v[columns], truth[columns]),
+            "own_gap": feature_gap(v[list(kept)], truth[list(kept)]),
             "gap": feature_gap(v, truth),
             "distance": (session.features.errors(fresh).mean(1) - expert).square().mean().sqrt().item(),
             "objective_after_online": stages.judge(session, mode(session, improved))["objective_x"],
         }
     return scores
+
+
+def _matching(prepared: Prepared, session: Session, kept: tuple[int, ...]) -> LSTMPolicy:
+    """The policy that Algorithm 2 learns when it knows these features only."""
+    chosen = SomeFeatures(**vars(session.features), kept=kept)
+    variant, scale, n_epochs = session.variant_params, session.scale_params, session.epochs(session.params.case.offline.epochs)
+    policy, generator = stages.fresh_policy(session), session.stream("offline", session.variant)
+    learner = Learner(policy, session.process, chosen, variant.learner, scale.episodes, n_epochs, generator)
+    start = initial_weights(variant.weights, len(session.task.set_point), session.dtype)[list(kept)]
+    known = prepared.demonstrations.features(chosen)
+    bar, memory = ProgressBar(n_epochs, f"{len(kept)} features"), stages.memory(session, learner, known, start)
+    return maxent_irl(learner, known, start, variant.weights, n_epochs, scale.measured, bar, memory).policy
 
 
 def record(session: Session, controller: Controller, purpose: str) -> stages.Demonstrations:

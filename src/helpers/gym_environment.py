@@ -42,19 +42,34 @@ class TrackingEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """A fresh episode; the input before it was u* = 0."""
         super().reset(seed=seed)
-        self.t = 0
-        self.x = self.initial_mean + self.initial_std * self.np_random.standard_normal(len(self.initial_mean))
-        return self._seen(np.zeros_like(self.middle)), {}
+        return self.begin(()), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One sample; `info` holds the true state x and the input u as applied."""
-        u = self.middle + self.half * np.clip(action, -1.0, 1.0)
-        noise = self.np_random.standard_normal(len(self.x))
-        self.x = self.state_step @ self.x + self.input_step @ u + self.disturbance_step * self.x * noise
-        reward = np.exp(-((self.beta * (self.set_point - self.x) / self.error_scale) ** 2)).sum()
-        self.t += 1
-        return self._seen(u), float(reward), self.t == self.n_steps, False, {"x": self.x, "u": u}
+        seen, reward = self.advance(action)
+        return seen, float(reward), self.over, False, {"x": self.x, "u": self.u}
 
-    def _seen(self, u: np.ndarray) -> np.ndarray:
-        y = self.x * (1 + self.observation_noise * self.np_random.standard_normal(len(self.x)))
-        return np.concatenate([(self.set_point - y) / self.error_unit, (u - self.middle) / self.half]).astype(np.float32)
+    def begin(self, batch: tuple[int, ...]) -> np.ndarray:
+        """Begin a batch of episodes; what is seen, shape (*batch, n_y + n_u). The shape () is a single episode."""
+        self.t = 0
+        self.x = self.initial_mean + self.initial_std * self.np_random.standard_normal((*batch, len(self.initial_mean)))
+        self.u = np.zeros((*batch, len(self.middle)))
+        return self._seen()
+
+    def advance(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """One sample of the whole batch: what is seen, and the rewards of shape batch, from actions (*batch, n_u)."""
+        self.u = self.middle + self.half * np.clip(action, -1.0, 1.0)
+        noise = self.np_random.standard_normal(self.x.shape)
+        self.x = self.x @ self.state_step.T + self.u @ self.input_step.T + self.disturbance_step * self.x * noise
+        self.t += 1
+        return self._seen(), np.exp(-((self.beta * (self.set_point - self.x) / self.error_scale) ** 2)).sum(-1)
+
+    @property
+    def over(self) -> bool:
+        """Whether the episodes have ended."""
+        return self.t == self.n_steps
+
+    def _seen(self) -> np.ndarray:
+        y = self.x * (1 + self.observation_noise * self.np_random.standard_normal(self.x.shape))
+        parts = [(self.set_point - y) / self.error_unit, (self.u - self.middle) / self.half]
+        return np.concatenate(parts, axis=-1).astype(np.float32)

@@ -283,7 +283,6 @@ class TrialParams(Record):
     title: Text
     family: Literal[
         "step size",
-        "averaging of alpha",
         "weights",
         "kept policy",
         "entropy",
@@ -451,6 +450,12 @@ class BaselineParams(ExperimentCases):
     episodes: Annotated[Count, Field(gt=1), Leaf("episodes")]
 
 
+class FeatureSetsParams(ExperimentCases):
+    """Algorithm 2 on some of the features, and on all of them alike."""
+
+    epochs: Annotated[Count, Leaf("epochs")]
+
+
 class OtherDemonstratorParams(ExperimentCases):
     """Demonstrators other than the PID."""
 
@@ -499,7 +504,7 @@ class ExperimentParams(Record):
     beta: BetaParams
     budget: BudgetParams
     baseline: BaselineParams
-    feature_sets: ExperimentCases
+    feature_sets: FeatureSetsParams
     demonstrators: OtherDemonstratorParams
     cloning: CloningParams
     fewer_demonstrations: FewerDemonstrationsParams

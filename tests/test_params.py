@@ -8,7 +8,7 @@ from ruamel.yaml import YAML
 
 from helpers.params import LEAF_KEYS, STATUSES, ParameterError, Params, load, load_published
 
-DELETE = object()
+DELETE = "delete this key"
 FILES = ("process.yaml", "demonstrators.yaml", "features.yaml", "learning.yaml", "case_1.yaml")
 
 

@@ -41,6 +41,7 @@ def test_the_response_figure_has_a_panel_a_variable_for_any_number_of_them(plant
     assert shown.loc[("y1", "record"), "last"] == pytest.approx(variable.steady_state + recorded.y[-1, :, 1].mean().item())
     assert shown.loc[("y1", "set point"), "last"] == variable.set_point
     assert {axis.get_ylabel() for axis in figure.axes if axis.get_visible()} == {"%"}
+    assert {"record, input", "policy, input"} <= set(shown.loc["u0"].index)
 
 
 def test_the_validation_figure_shows_a_window_and_the_residuals(plant):

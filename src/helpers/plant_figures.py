@@ -77,7 +77,9 @@ def response_figure(response: pd.DataFrame, description: PlantDescription) -> Fi
         for axis in axes[len(variables) :]:
             axis.set_visible(False)
         for axis, variable in zip(axes, variables, strict=False):
-            for controller, label in (("expert", "record"), ("agent", "policy")):
+            words = variable.description or variable.name
+            for controller, source in (("expert", "record"), ("agent", "policy")):
+                label = source if kind == "controlled" else f"{source}, input"
                 lines = response[(response["variable"] == variable.name) & (response["controller"] == controller)]
                 mean, time, colour = lines["mean"] + variable.steady_state, lines["time_index"], COLOURS[kind, controller]
                 steps, step = ("steps-post", "post") if kind == "manipulated" else ("default", None)
@@ -85,11 +87,11 @@ def response_figure(response: pd.DataFrame, description: PlantDescription) -> Fi
                 axis.fill_between(time, mean - lines["std"], mean + lines["std"], color=colour, alpha=0.2, linewidth=0, step=step)
             if isinstance(variable, ControlledVariable):
                 axis.axhline(variable.set_point, color=SET_POINT, linestyle=LINE_STYLES["set point"], label="set point")
-            axis.set_title(f"{symbol(variable.name)} ({variable.tag})", loc="left")
+            axis.set_title(f"{words[:1].upper()}{words[1:]} ({variable.tag})", loc="left")
             axis.set_ylabel(variable.unit)
             axis.set_xlabel("sample" if kind == "manipulated" else "")
             axis.set_label(variable.name)
-    handles = grid[0, 0].get_legend_handles_labels()[0]
+    handles = [handle for axes in grid for handle in axes[0].get_legend_handles_labels()[0]]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     return figure
 

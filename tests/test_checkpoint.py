@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from test_stages import session
 
-from helpers import stages
+from helpers import equal_budget, experiments, limits, stages
 from helpers.checkpoint import Checkpoints
 from helpers.params import LearnerParams
 
@@ -50,17 +50,32 @@ def online(opened):
     return result.records, 0, list(result.policy.state_dict().values())
 
 
+def frozen(opened):
+    weights = torch.linspace(-1.0, 1.0, 6, dtype=opened.dtype)
+    return (), 0, list(experiments.learn_under(opened, weights, 8, "frozen").state_dict().values())
+
+
+def budgeted(opened):
+    contest = limits.enter(opened)
+    small = contest.scale.model_copy(update={"episodes": 200, "every": 50, "judged": 10})
+    contest = replace(contest, params=contest.params.model_copy(update={"scales": {"smoke": small}}))
+    result = equal_budget.reinforced(contest, stages.fresh_policy(opened), "scratch", True)
+    return result.curve, 0, list(result.build.args[0].state_dict().values())
+
+
 def assert_equal(found, expected):
     assert found[:2] == expected[:2]
     assert all(left.dtype == right.dtype and torch.equal(left, right) for left, right in zip(found[2], expected[2], strict=True))
 
 
 # The printed variant has several epochs in an iteration, and stops early; so has a trial with the natural gradient no moments.
-LEARNING = [(offline, "improved"), (offline, "printed"), (offline, "natural_gradient"), (online, "improved")]
+LEARNING = [(offline, "improved", dtype) for dtype in ("float32", "float64")]
+LEARNING += [(online, "improved", dtype) for dtype in ("float32", "float64")]
+LEARNING += [(offline, "printed", "float32"), (offline, "natural_gradient", "float32")]
+LEARNING += [(frozen, "improved", "float32"), (budgeted, "improved", "float32")]
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize(("learn", "variant"), LEARNING)
+@pytest.mark.parametrize(("learn", "variant", "dtype"), LEARNING)
 def test_a_training_killed_again_and_again_ends_at_the_very_same_bits(tmp_path, learn, variant, dtype):
     undisturbed = learn(run(tmp_path / "undisturbed", variant, dtype))
     assert undisturbed[2][0].dtype == getattr(torch, dtype)

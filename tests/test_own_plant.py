@@ -115,7 +115,8 @@ def test_the_command_goes_from_a_file_to_a_controller_and_a_report(tmp_path, qui
     report = (tmp_path / "out/report.md").read_text(encoding="utf-8")
     for heading in ("# made up", "## Data quality", "## Model on held-out records", "## Reward weights", "## Controllers"):
         assert heading in report
-    assert {file.name for file in (tmp_path / "out").iterdir()} == {"report.md", "policy.onnx", "quality.png", "model.png"}
+    pictures = {"quality.png", "model.png", "learning.png", "response.png"}
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {"report.md", "policy.onnx", *pictures}
     policy = DeployedPolicy(tmp_path / "out/policy.onnx")
     y, u = np.array([[50.0, 51.0, 52.0]]), np.array([[20.0, 21.0]])
     assert policy.step(y, y, u).shape == (1, 2)
@@ -149,6 +150,10 @@ def test_readme_s_command_and_loop_run_as_they_stand(tmp_path, quick_root, monke
     monkeypatch.chdir(tmp_path)
     (tmp_path / "notebooks").symlink_to(PROJECT / "notebooks")
     assert plant_report.main([*words[3:], "--params", str(quick_root)]) == 0
+    report = (tmp_path / "results/tank/report.md").read_text(encoding="utf-8")
+    assert "## Controllers after the transfer" in report
+    aims = [entry["set_point"] for entry in DeployedPolicy(tmp_path / "results/tank/policy_transfer.onnx").notes["controlled"]]
+    assert aims == [1.5, 353.0]
     namespace = {}
     exec(python, namespace)
     assert namespace["inputs"] == pytest.approx([24.0, 410.0])  # without a jump from what the operator applied

@@ -35,6 +35,8 @@ def test_the_committed_description_gives_the_task_of_case_study_one_with_its_own
     assert [loop.proportional for loop in description.pid] == list(history.proportional)
     assert [loop.integral for loop in description.pid] == list(history.integral)
     assert task.n_steps == expected.n_steps
+    aim = [description.transfer[variable.name] - variable.steady_state for variable in description.controlled]
+    assert aim == list(history.other_set_point)
 
 
 @pytest.mark.parametrize(
@@ -51,6 +53,9 @@ def test_the_committed_description_gives_the_task_of_case_study_one_with_its_own
         (changed("manipulated", 1, "name", value="y0"), ["the name 'y0' occurs twice"]),
         (changed("pid", 0, "manipulated", value="valve"), ["the manipulated variable 'valve', which is not described"]),
         (changed("controlled", value=[]), ["'controlled'"]),
+        (changed("transfer", value={"u0": 51.0}), ["'transfer' names 'u0', which is no controlled variable"]),
+        (changed("transfer", value={"y0": 1.0e9}), ["'transfer' takes 'y0' outside 'low' to 'high'"]),
+        (changed("transfer", value={"y0": "far"}), ["'transfer.y0'"]),
     ],
 )
 def test_what_cannot_be_is_refused(content, says, tmp_path):

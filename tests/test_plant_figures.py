@@ -31,6 +31,19 @@ def test_the_quality_figure_has_a_panel_a_variable_with_its_unit(plant):
     assert drawn_summary(first)["from"].min() == 10
 
 
+def test_the_response_figure_has_a_panel_a_variable_for_any_number_of_them(plant):
+    recorded = plant.demonstrations.trajectories
+    response = response_table(recorded, recorded, plant.controlled, plant.manipulated)
+    figure = plant_figures.response_figure(response, plant.description)
+    shown = drawn_summary(figure).set_index(["panel", "artist"])
+    assert [axis.get_label() for axis in figure.axes if axis.get_visible()] == ["y0", "y1", "y2", "u0", "u1"]
+    variable = plant.description.controlled[1]
+    assert shown.loc[("y1", "record"), "last"] == pytest.approx(variable.steady_state + recorded.y[-1, :, 1].mean().item())
+    assert shown.loc[("y1", "set point"), "last"] == variable.set_point
+    assert {axis.get_ylabel() for axis in figure.axes if axis.get_visible()} == {"%"}
+    assert {"record, input", "policy, input"} <= set(shown.loc["u0"].index)
+
+
 def test_the_validation_figure_shows_a_window_and_the_residuals(plant):
     _, validation = own_plant.identify_plant(plant)
     figure = plant_figures.validation_figure(validation, plant.description)

@@ -24,7 +24,7 @@ from torture.runs import Place
 PACKAGES = ("slurmctld", "slurmd", "slurm-client", "munge")
 PROFILE = "profiles/slurm/without_accounting"
 SYSTEM = Path("/etc/slurm/slurm.conf")  # where commands inside a job look: the plugin takes SLURM_CONF out of its environment
-PATIENCE = 120.0  # seconds for the node to come up
+PATIENCE = 120.0  # seconds for a package manager to answer and for the node to come up
 CONFIGURATION = """\
 ClusterName=loopback
 SlurmctldHost={host}(127.0.0.1)
@@ -68,8 +68,13 @@ def install() -> None:
     if os.geteuid() != 0 or not shutil.which("apt-get"):
         raise SkipError("installing SLURM needs root and apt-get")
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    options = ["-o", "Acquire::Retries=0", "-o", "Acquire::http::Timeout=20", "-o", "Acquire::https::Timeout=20"]
     for words in (["update", "-qq"], ["install", "-y", "-qq", "--no-install-recommends", *PACKAGES]):
-        done = subprocess.run(["apt-get", *words], env=environment, capture_output=True, text=True, check=False)
+        command = ["apt-get", *options, *words]
+        try:
+            done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=PATIENCE)
+        except subprocess.TimeoutExpired as error:
+            raise SkipError(f"apt-get did not answer within {PATIENCE:.0f} s") from error
     if done.returncode:
         raise SkipError(f"apt-get could not install {', '.join(PACKAGES)}: {done.stderr.strip().splitlines()[-1:]}")
 

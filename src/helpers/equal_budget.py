@@ -108,11 +108,17 @@ def reinforced(contest: Contest, start: LSTMPolicy, purpose: str, dense: bool) -
     features = session.features.on("x")
     generator = session.stream("limits", purpose)
     learner = Learner(policy, session.process, features, online.learner, contest.batch, n_epochs, generator)
-    visitor(0, stages.deploy(session, learner.average))
-    for _ in range(n_epochs):
+    memory = stages.memory(session, learner, purpose)
+    if (state := memory.recall()) is None:
+        visitor(0, stages.deploy(session, learner.average))
+    else:
+        learner.restore(state["learner"])
+        visitor.curve = [(int(episodes), *judged) for episodes, *judged in state["curve"]]
+    while learner.epochs < n_epochs:
         learner.epoch(partial(features.tracking, beta=contest.sharpness(learner.episodes, dense)))
         if visitor.due(learner.episodes):
             visitor(learner.episodes, stages.deploy(session, learner.average))
+        memory.keep(lambda: {"learner": learner.state(), "curve": visitor.curve}, finished=learner.epochs == n_epochs)
     return Learned(partial(_deployed, learner.average), visitor.curve)
 
 

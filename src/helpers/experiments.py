@@ -6,7 +6,7 @@ whose experiment is not planned for the session's case (params/experiments.yaml)
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -22,6 +22,7 @@ from helpers.params import ComparisonParams, ExperimentCases, ExperimentParams, 
 from helpers.policy import LSTMPolicy, PolicyController
 from helpers.progress import ProgressBar
 from helpers.reinforce import (
+    EpochRecord,
     Learner,
     TrainingError,
     baseline_regressors,
@@ -312,15 +313,23 @@ def transfer(prepared: Prepared) -> Scores:
 
 def learn_under(session: Session, weights: Tensor, n_epochs: int, label: str) -> LSTMPolicy:
     """Algorithm 1 from an untrained policy under a reward whose weights stay as they are."""
-    generator, params, n_episodes = (
-        session.stream("experiments", "frozen"),
-        session.variant_params.learner,
-        economical(session).scale_params.episodes,
-    )
+    generator, params = session.stream("experiments", "frozen"), session.variant_params.learner
+    n_episodes = economical(session).scale_params.episodes
     policy = stages.fresh_policy(session)
     learner = Learner(policy, session.process, session.features, params, n_episodes, n_epochs, generator)
     reward = partial(apprentice_reward, features=session.features, weights=weights)
-    reinforce(learner, reward, n_epochs, report=ProgressBar(n_epochs, label))
+    memory, earlier = stages.memory(session, learner, weights), list[EpochRecord]()
+    if (state := memory.recall()) is not None:
+        learner.restore(state["learner"])
+        earlier = [EpochRecord(**row) for row in state["records"]]
+
+    def state_of(records: Sequence[EpochRecord]) -> dict[str, Any]:
+        return {"learner": learner.state(), "records": [asdict(record) for record in records]}
+
+    def keep(records: Sequence[EpochRecord]) -> None:
+        memory.keep(partial(state_of, records), finished=len(records) == n_epochs)
+
+    reinforce(learner, reward, n_epochs, report=ProgressBar(n_epochs, label), earlier=earlier, keep=keep)
     return learner.average
 
 

@@ -84,6 +84,7 @@ class PlantDescription(Record):
         sampling_time: in `time_unit`. horizon: T, samples of an episode. episode: a column that changes with every run.
         mode: a column; only rows where it holds one of `automatic` show the controller at work.
         plant: what stands for the plant online, `package.module:Class` or `gymnasium:Id`; without it the identified model does.
+        transfer: other set points by name of the controlled variable, which the file has steps to as well; none: no transfer.
     """
 
     title: Text
@@ -99,6 +100,7 @@ class PlantDescription(Record):
     manipulated: Annotated[tuple[ManipulatedVariable, ...], Field(min_length=1)]
     pid: tuple[LoopGains, ...] = ()
     plant: Text | None = None
+    transfer: dict[Text, Real] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -114,6 +116,12 @@ class PlantDescription(Record):
                 if name not in known:
                     found: dict[str, Any] = {"key": key, "name": name}
                     raise PydanticCustomError("pid", "'pid' names the {key} variable '{name}', which is not described", found)
+        for name, value in self.transfer.items():
+            aimed = next((variable for variable in self.controlled if variable.name == name), None)
+            if aimed is None:
+                raise PydanticCustomError("transfer", "'transfer' names '{name}', which is no controlled variable", {"name": name})
+            if not aimed.low <= value <= aimed.high:
+                raise PydanticCustomError("transfer", "'transfer' takes '{name}' outside 'low' to 'high'", {"name": name})
         return self
 
     @property

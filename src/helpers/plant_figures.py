@@ -11,7 +11,7 @@ from statsmodels.tsa.stattools import acf
 from helpers.data_quality import CleanRecords
 from helpers.figures import COLOURS, INK, LINE_STYLES, SET_POINT, WIDTH, empty_figure
 from helpers.params import DEVIATION
-from helpers.plant_description import PlantDescription, Variable
+from helpers.plant_description import ControlledVariable, PlantDescription, Variable
 from helpers.system_identification import Validation
 from helpers.tables import symbol
 
@@ -59,6 +59,39 @@ def quality_figure(clean: CleanRecords, description: PlantDescription, first: in
     axes[-1].xaxis.set_major_locator(MaxNLocator(8, integer=True))
     handles: list[Patch | Line2D] = [Patch(color=LEFT_OUT, label="left out"), Patch(color=BY_HAND, label="not in automatic")]
     handles.append(Line2D([], [], color=SET_POINT, linestyle=LINE_STYLES["set point"], label="set point"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    return figure
+
+
+def response_figure(response: pd.DataFrame, description: PlantDescription) -> Figure:
+    """Controlled variables above, inputs below, under a policy and as recorded: mean and standard deviation, engineering units.
+
+    Args:
+        response: of `figures.response_table`, the policy as the agent and the record as the expert; deviation variables.
+    """
+    rows = {"controlled": description.controlled, "manipulated": description.manipulated}
+    n_columns = max(len(variables) for variables in rows.values())
+    figure = empty_figure(max(WIDTH, WIDTH / 2 * n_columns), 5.6)
+    grid = figure.subplots(2, n_columns, sharex=True, squeeze=False)
+    for axes, (kind, variables) in zip(grid, rows.items(), strict=True):
+        for axis in axes[len(variables) :]:
+            axis.set_visible(False)
+        for axis, variable in zip(axes, variables, strict=False):
+            words = variable.description or variable.name
+            for controller, source in (("expert", "record"), ("agent", "policy")):
+                label = source if kind == "controlled" else f"{source}, input"
+                lines = response[(response["variable"] == variable.name) & (response["controller"] == controller)]
+                mean, time, colour = lines["mean"] + variable.steady_state, lines["time_index"], COLOURS[kind, controller]
+                steps, step = ("steps-post", "post") if kind == "manipulated" else ("default", None)
+                axis.plot(time, mean, color=colour, linestyle=LINE_STYLES[controller], drawstyle=steps, label=label)
+                axis.fill_between(time, mean - lines["std"], mean + lines["std"], color=colour, alpha=0.2, linewidth=0, step=step)
+            if isinstance(variable, ControlledVariable):
+                axis.axhline(variable.set_point, color=SET_POINT, linestyle=LINE_STYLES["set point"], label="set point")
+            axis.set_title(f"{words[:1].upper()}{words[1:]} ({variable.tag})", loc="left")
+            axis.set_ylabel(variable.unit)
+            axis.set_xlabel("sample" if kind == "manipulated" else "")
+            axis.set_label(variable.name)
+    handles = [handle for axes in grid for handle in axes[0].get_legend_handles_labels()[0]]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     return figure
 

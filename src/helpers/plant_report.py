@@ -16,10 +16,12 @@ from matplotlib.figure import Figure
 
 from helpers.deployment import DeployedPolicy, disagreement, export
 from helpers.evaluation import feature_gap
-from helpers.figures import DPI_FILE
+from helpers.figures import DPI_FILE, learning_curves, response_table
 from helpers.own_plant import (
     OwnPlant,
+    as_measured,
     compare,
+    history,
     identify_plant,
     improve_on,
     judge,
@@ -27,14 +29,16 @@ from helpers.own_plant import (
     open_plant,
     task_at_rest,
     task_on,
+    transfer,
 )
 from helpers.params import InputError, load
-from helpers.plant_figures import quality_figure, validation_figure
+from helpers.plant_figures import quality_figure, response_figure, validation_figure
 from helpers.plant_model import load_plant
 from helpers.policy import LSTMPolicy
 from helpers.process import Process
 from helpers.sources import PROJECT
 from helpers.task import ControlTask
+from helpers.trajectories import Trajectories
 
 AGREEMENT = 1e-5  # of the input range, between the exported policy and torch
 
@@ -76,6 +80,19 @@ def export_policy(plant: OwnPlant, policy: LSTMPolicy, process: Process, task: C
     return worst
 
 
+def exported(plant: OwnPlant, policy: LSTMPolicy, process: Process, task: ControlTask, path: Path) -> str:
+    """`export_policy` as a sentence of the report."""
+    worst = export_policy(plant, policy, process, task, path)
+    return f"{path.name} agrees with the learned policy to {worst:.1g} of the input range over whole episodes"
+
+
+def beside_the_record(plant: OwnPlant, batch: Trajectories) -> Figure:
+    """The response under a policy beside the recorded one."""
+    recorded = plant.demonstrations.trajectories
+    response = response_table(as_measured(batch), as_measured(recorded), plant.controlled, plant.manipulated)
+    return response_figure(response, plant.description)
+
+
 def run(path: Path, output: Path, params_root: Path, scale: str, seed: int) -> Outcome:
     """The whole chain for one description; writes into `output`."""
     params = load(params_root, 1)
@@ -102,8 +119,7 @@ def run(path: Path, output: Path, params_root: Path, scale: str, seed: int) -> O
     recorded = judge(plant, plant_task, {"record": found.trajectories, **batches})
     gap = feature_gap(features.trajectory(batches["offline"]).mean(0), features.trajectory(found.trajectories).mean(0))
     sentences.append(f"feature gap between the offline policy and the record: {100 * gap:.1f} %")
-    worst = export_policy(plant, online, process, plant_task, output / "policy.onnx")
-    sentences.append(f"policy.onnx agrees with the learned policy to {worst:.1g} of the input range over whole episodes")
+    sentences.append(exported(plant, online, process, plant_task, output / "policy.onnx"))
     fit = pd.DataFrame({"fit": validation.fit, "Ljung-Box p": validation.p_value}, index=list(plant.controlled))
     weights = pd.DataFrame({"alpha*": offline.weights.tolist()}, index=plant.feature_names)
     tables = {
@@ -112,7 +128,21 @@ def run(path: Path, output: Path, params_root: Path, scale: str, seed: int) -> O
         "Reward weights": weights,
         "Controllers": recorded,
     }
-    figures = {"quality": quality_figure(plant.clean, plant.description), "model": validation_figure(validation, plant.description)}
+    learned = history(offline.records, plant.feature_names)
+    figures = {
+        "quality": quality_figure(plant.clean, plant.description),
+        "model": validation_figure(validation, plant.description),
+        "learning": learning_curves(learned),
+        "response": beside_the_record(plant, batches["online"]),
+    }
+    if plant.description.transfer:
+        moved = transfer(plant, offline, model, process, plant.description.transfer)
+        policies = {"before": offline.policy, "transferred": moved.offline.policy, "online": moved.online}
+        batches = compare(moved.plant, process, moved.task, policies)
+        batches = {"record": moved.plant.demonstrations.trajectories, **batches}
+        tables["Controllers after the transfer"] = judge(moved.plant, moved.task, batches)
+        figures["response_transfer"] = beside_the_record(moved.plant, batches["online"])
+        sentences.append(exported(moved.plant, moved.online, process, moved.task, output / "policy_transfer.onnx"))
     outcome = Outcome(tables, figures, tuple(sentences))
     write(outcome, plant.description.title, output)
     return outcome
@@ -144,7 +174,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print("\n".join(outcome.sentences))
-    print(f"written: {given.output / 'report.md'}, {given.output / 'policy.onnx'}")
+    written = ["report.md", "policy.onnx", *(path.name for path in [given.output / "policy_transfer.onnx"] if path.is_file())]
+    print(f"written to {given.output}: {', '.join(written)}")
     return 0
 
 

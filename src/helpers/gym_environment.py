@@ -45,9 +45,9 @@ class TrackingEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self.begin(()), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One sample; `info` holds the true state x and the input u as applied."""
+        """One sample; `info` holds the true state x, its observation y and the input u as applied."""
         seen, reward = self.advance(action)
-        return seen, float(reward), self.over, False, {"x": self.x, "u": self.u}
+        return seen, float(reward), self.over, False, {"x": self.x, "y": self.y, "u": self.u}
 
     def begin(self, batch: tuple[int, ...]) -> np.ndarray:
         """Begin a batch of episodes; what is seen, shape (*batch, n_y + n_u). The shape () is a single episode."""
@@ -70,6 +70,6 @@ class TrackingEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self.t == self.n_steps
 
     def _seen(self) -> np.ndarray:
-        y = self.x * (1 + self.observation_noise * self.np_random.standard_normal(self.x.shape))
-        parts = [(self.set_point - y) / self.error_unit, (self.u - self.middle) / self.half]
+        self.y = self.x * (1 + self.observation_noise * self.np_random.standard_normal(self.x.shape))
+        parts = [(self.set_point - self.y) / self.error_unit, (self.u - self.middle) / self.half]
         return np.concatenate(parts, axis=-1).astype(np.float32)

@@ -275,15 +275,13 @@ def test_a_wrong_file_is_one_sentence(tmp_path):
         assert "\n" not in str(caught.value)
 
 
-def to_digits_of(filed, value):
-    """`value` rounded to as many significant digits as `filed` is written with; to its decimals where it is zero."""
-    digits = len(f"{filed:g}".replace(".", "").strip("0"))
-    return round(value, 1) if filed == 0 else float(f"{value:.{digits}g}")
-
-
 @pytest.mark.skipif(not REFERENCE.is_dir(), reason="no run was published yet")
 def test_the_parameter_files_hold_what_the_reference_run_inferred():
-    """Gains are the fitted ones, rounded; sampling time and bounds are round numbers that the tables cannot tell from the best."""
+    """Sampling time and bounds are round numbers, gains the fitted ones: all inside the interval in which the tables cannot tell.
+
+    Gains lie within a tenth of its width of the fit. They cannot be the fit to the last digit: the sampling errors that weigh
+    the rows are those of the controller in the files, so a new fit moves a little with every change of the files.
+    """
     found = pd.read_csv(REFERENCE / "settings.csv").set_index(["setting", "component"])
     process = FIRST.process
     filed = {TIME: process.sampling_time}
@@ -300,8 +298,7 @@ def test_the_parameter_files_hold_what_the_reference_run_inferred():
     for key, value in filed.items():
         row = found.loc[key]
         assert row["in_parameter_files"] == value
+        assert row["low"] <= value <= row["high"], key
         if key[0].startswith("PID"):
-            assert to_digits_of(value, row["value"]) == value, key
-        else:
-            assert row["low"] <= value <= row["high"], key
+            assert abs(value - row["value"]) <= 0.1 * (row["high"] - row["low"]), key
     assert CASES[3].demonstrator == CASES[1].demonstrator

@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from helpers.features import tracking_reward  # noqa: E402
 from helpers.gym_environment import TrackingEnv  # noqa: E402
-from helpers.library_learners import LibraryController, TrackingEnvs, learn, library_learner  # noqa: E402
+from helpers.library_learners import HeadStartPolicy, LibraryController, TrackingEnvs, learn, library_learner  # noqa: E402
 from helpers.limits_params import load_limits  # noqa: E402
 from helpers.randomness import stream  # noqa: E402
 from helpers.rollout import rollout  # noqa: E402
@@ -73,6 +73,25 @@ def test_episodes_side_by_side_are_single_ones(make):
     assert not np.allclose(seen[-1], first)  # the next episodes have begun, from other states
     batch.seed(5)
     assert np.array_equal(batch.reset(), first)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_start_at_the_head_of_a_sequence_needs_no_loop_over_time(inside):
+    """Outputs, states and gradients of the library's own loop, also where an episode does start inside a sequence."""
+    generator = torch.Generator().manual_seed(1)
+    lstm = torch.nn.LSTM(3, 4, num_layers=2)
+    features = torch.randn(5 * 7, 3, generator=generator)
+    states = tuple(torch.randn(2, 5, 4, generator=generator) for _ in range(2))
+    starts = torch.zeros(5, 7)
+    starts[[0, 3], 0] = 1.0
+    starts[1, 4] = float(inside)
+    found = []
+    for policy in (HeadStartPolicy, HeadStartPolicy.__base__):
+        lstm.zero_grad()
+        output, (hidden, cell) = policy._process_sequence(features, states, starts.flatten(), lstm)
+        output.square().sum().backward()
+        found.append([output, hidden, cell, *(weight.grad.clone() for weight in lstm.parameters())])
+    assert all(torch.allclose(mine, its, atol=1e-5) for mine, its in zip(*found, strict=True))
 
 
 @pytest.mark.parametrize("name", ["ppo", "recurrent_ppo"])

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from sb3_contrib import RecurrentPPO
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -26,6 +27,26 @@ from helpers.process import LinearProcess
 from helpers.task import ControlTask
 
 NAMES = ("ppo", "recurrent_ppo")
+
+
+class HeadStartPolicy(RecurrentActorCriticPolicy):
+    """The library's recurrent policy without its loop over time.
+
+    The library goes step by step through every batch in which an episode starts, because the state has to be reset there. In a
+    batch of whole episodes they start at the head of a sequence only: with the state reset before, one call of the LSTM will do.
+    """
+
+    @staticmethod
+    def _process_sequence(
+        features: Tensor, lstm_states: tuple[Tensor, Tensor], episode_starts: Tensor, lstm: torch.nn.LSTM
+    ) -> tuple[Tensor, Tensor]:
+        starts = episode_starts.reshape(lstm_states[0].shape[1], -1)
+        if not starts[:, 1:].any():
+            kept = (1 - starts[:, 0])[None, :, None]
+            lstm_states = (kept * lstm_states[0], kept * lstm_states[1])
+            episode_starts = torch.zeros_like(episode_starts)
+        output: tuple[Tensor, Tensor] = RecurrentActorCriticPolicy._process_sequence(features, lstm_states, episode_starts, lstm)
+        return output
 
 
 class TrackingEnvs(VecEnv):
@@ -151,10 +172,8 @@ def library_learner(
     if name == "ppo":
         return PPO("MlpPolicy", environments, policy_kwargs={"net_arch": list(params.network), "log_std_init": deviation}, **common)
     cells = policy.hidden_cells
-    # The value is read off the policy's own LSTM: one of its own would double the time, which the library spends in a loop over t.
     layers = {"lstm_hidden_size": cells[0], "n_lstm_layers": len(cells), "net_arch": [], "log_std_init": deviation}
-    layers |= {"shared_lstm": True, "enable_critic_lstm": False}
-    return RecurrentPPO("MlpLstmPolicy", environments, policy_kwargs=layers, **common)
+    return RecurrentPPO(HeadStartPolicy, environments, policy_kwargs=layers, **common)
 
 
 def learn(

@@ -297,6 +297,7 @@ def test_the_parameter_files_hold_what_the_reference_run_inferred():
     assert set(found.index) == set(filed)
     for key, value in filed.items():
         row = found.loc[key]
+        assert row["in_parameter_files"] == value
         assert row["low"] <= value <= row["high"], key
         if key[0].startswith("PID"):
             assert abs(value - row["value"]) <= 0.1 * (row["high"] - row["low"]), key

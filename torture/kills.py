@@ -8,6 +8,7 @@ import os
 import random
 import signal
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 
 import psutil
@@ -60,11 +61,19 @@ def undisturbed(place: Place, **start: str) -> tuple[Content, float]:
     return place.content(), time.perf_counter() - began
 
 
-def survive(place: Place, expected: Content, seconds: float, kills: int, seed: int) -> Tally:
+def survive(
+    place: Place,
+    expected: Content,
+    seconds: float,
+    kills: int,
+    seed: int,
+    report: Callable[[Tally], None] = lambda tally: None,
+) -> Tally:
     """Kill and resume runs in `place` until there were that many kills, let the last one end, and compare every one that ends.
 
     Args:
         expected: what an undisturbed run made in `seconds`, within which the moments of the kills are drawn.
+        report: called after each kill.
     """
     draw, tally = random.Random(seed), Tally(seconds=seconds)
     started: list[psutil.Process] = []
@@ -78,6 +87,7 @@ def survive(place: Place, expected: Content, seconds: float, kills: int, seed: i
             killed = strike(engine.pid, KINDS[number % len(KINDS)], draw.uniform(0.0, seconds), started)
         if killed:
             tally.kills[killed] += 1
+            report(tally)
         engine.wait(PATIENCE)
         found, safe = place.finished(), place.safe()
         gone = {name for name in kept if found.get(name) != kept[name]}

@@ -41,13 +41,21 @@ def say(text: str) -> None:
     print(text, flush=True)
 
 
+def progress(tally: Tally) -> None:
+    """A line after every tenth kill."""
+    if (number := sum(tally.kills.values())) % 10 == 0:
+        say(
+            f"{number} kills, {tally.rounds} runs ended: {tally.lost} results lost, {tally.differing} differing, {tally.left} files left"
+        )
+
+
 def killed_runs(kills: int, seed: int, whole: bool) -> Tally:
     """A smoke run (`whole`: with everything up to the report), killed and resumed."""
     with tempfile.TemporaryDirectory() as folder:
         place = Place.copied(Path(folder) / "project", targets=() if whole else CHAIN)
         expected, seconds = undisturbed(place)
         say(f"undisturbed: {len(expected)} results in {seconds:.0f} s")
-        return survive(place, expected, seconds, kills, seed)
+        return survive(place, expected, seconds, kills, seed, progress)
 
 
 def mutated_input(cases: int) -> tuple[int, float, bool]:

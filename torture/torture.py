@@ -44,9 +44,8 @@ def say(text: str) -> None:
 def progress(tally: Tally) -> None:
     """A line after every tenth kill."""
     if (number := sum(tally.kills.values())) % 10 == 0:
-        say(
-            f"{number} kills, {tally.rounds} runs ended: {tally.lost} results lost, {tally.differing} differing, {tally.left} files left"
-        )
+        found = f"lost {tally.lost}, differing {tally.differing}, files left {tally.left}"
+        say(f"{number} kills, {tally.rounds} runs ended: {found}")
 
 
 def killed_runs(kills: int, seed: int, whole: bool) -> Tally:

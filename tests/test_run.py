@@ -267,11 +267,9 @@ def test_finished_stages_are_skipped(finished):
         ("params/case_2.yaml", "250", "249", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
         ("params/learning.yaml", "std_high: {value: 0.25", "std_high: {value: 0.3", ONLINE),
         ("params/learning.yaml", "episodes: {value: 400", "episodes: {value: 300", {"report": 1}),  # of another scale
-        ("params/published.yaml", "21.63", "21.64", {"report": 1}),
         ("notebooks/04_knowledge_transfer.ipynb", "carried = ", "taken = ", {"transfer": 1, "transfer_alone": 1, "report": 1}),
         ("src/helpers/maxent_irl.py", "projected", "", {}),
         ("src/helpers/maxent_irl.py", "return project(self.mean)", "return project(self.mean.clone())", ONE_SEED),
-        ("src/helpers/report.py", "RUNNERS = (", "RUNNERS = (*(),", {"report": 1}),
         ("reports/template/report.md.jinja", "# In one page", "# In a page", {"report": 1}),
         ("src/helpers/figures.py", "MUTED = ", "MUTED: str = ", ONE_SEED),  # stages store what they draw (response.csv)
     ],
@@ -291,6 +289,22 @@ def test_a_change_makes_exactly_what_depends_on_it_run_again(finished, changed, 
         assert finished(seeds=2) == second  # of which there is nothing yet
         path.write_text(before, encoding="utf-8")
         assert finished() == {}  # whatever the times of the files
+
+
+@pytest.mark.parametrize(
+    ("changed", "old", "new"),
+    [("params/published.yaml", "21.63", "21.64"), ("src/helpers/report.py", "RUNNERS = (", "RUNNERS = (*(),")],
+)
+def test_a_change_to_what_the_report_alone_reads_leaves_every_stage_as_it_is(plan, changed, old, new):
+    def made_from():
+        stages = {"05_report": (None, "improved"), "02_offline_irl": (1, "printed"), "04_knowledge_transfer": (3, "improved")}
+        folder = plan.folder
+        return {name: identity.inputs(name, folder / "params", "smoke", *run, folder) for name, run in stages.items()}
+
+    before = made_from()
+    text = (plan.folder / changed).read_text(encoding="utf-8")
+    (plan.folder / changed).write_text(text.replace(old, new, 1), encoding="utf-8")
+    assert [name for name, inputs in made_from().items() if inputs != before[name]] == ["05_report"]
 
 
 def test_a_damaged_record_is_made_again(finished):

@@ -66,7 +66,7 @@ def mutated_input(cases: int) -> tuple[int, float, bool]:
     )
     if done.returncode:
         say(done.stdout[-6000:])
-    tried = sum(int(number) for number in re.findall(r"(\d+) passing examples", done.stdout))
+    tried = sum(int(number) for number in re.findall(r"(\d+) passing\b", done.stdout))
     return tried, time.perf_counter() - began, done.returncode == 0
 
 

@@ -6,6 +6,7 @@ local run to the last bit, and stops what it started. Packages stay installed.
 """
 
 import argparse
+import getpass
 import os
 import shutil
 import signal
@@ -25,6 +26,7 @@ PACKAGES = ("slurmctld", "slurmd", "slurm-client", "munge")
 PROFILE = "profiles/slurm/without_accounting"
 SYSTEM = Path("/etc/slurm/slurm.conf")  # where commands inside a job look: the plugin takes SLURM_CONF out of its environment
 PATIENCE = 120.0  # seconds for a package manager to answer and for the node to come up
+JOBS = 20.0  # seconds for cancelled jobs to end
 CONFIGURATION = """\
 ClusterName=loopback
 SlurmctldHost={host}(127.0.0.1)
@@ -122,6 +124,7 @@ def one_node(folder: Path) -> Iterator[dict[str, str]]:
             _wait_until_idle(environment, folder)
             yield environment
         finally:
+            _cancel_jobs(environment)
             SYSTEM.unlink(missing_ok=True)
             for process in reversed(started):
                 process.terminate()
@@ -130,6 +133,17 @@ def one_node(folder: Path) -> Iterator[dict[str, str]]:
                 except subprocess.TimeoutExpired:
                     process.kill()
                     process.wait()
+
+
+def _cancel_jobs(environment: dict[str, str]) -> None:
+    """Jobs would outlive the daemons. At the end of an undisturbed run there are none."""
+    found = {**os.environ, **environment}
+    subprocess.run(["scancel", "--user", getpass.getuser()], env=found, capture_output=True, check=False)
+    end = time.monotonic() + JOBS
+    while time.monotonic() < end:
+        if not subprocess.run(["squeue", "-h"], env=found, capture_output=True, check=False).stdout.strip():
+            return
+        time.sleep(0.5)
 
 
 def _free_ports(number: int) -> list[int]:
@@ -163,8 +177,12 @@ def compare(seeds: int, targets: Sequence[str], environment: dict[str, str], fol
     seconds = []
     for place, extra in ((local, {}), (cluster, environment)):
         began = time.perf_counter()
-        with (place.project / "said.log").open("wb") as log:
-            status = place.start(output=log, **extra).wait()
+        with (place.project / "said.log").open("wb") as log, place.start(output=log, **extra) as run:
+            try:
+                status = run.wait()
+            finally:
+                if run.poll() is None:  # stopped from outside
+                    os.killpg(run.pid, signal.SIGKILL)
         seconds.append(time.perf_counter() - began)
         if status:
             logs = [place.project / "said.log", *place.project.glob(".snakemake/slurm_logs/**/*.log")]

@@ -12,10 +12,8 @@ from helpers.controllers import Controller, Operator
 from helpers.evaluation import feature_gap, objective
 from helpers.experiments import Prepared, Scores, copied, economical, gap_to, mode, predictive, varied
 from helpers.features import FeatureMap
-from helpers.maxent_irl import initial_weights, maxent_irl
+from helpers.maxent_irl import initial_weights
 from helpers.policy import LSTMPolicy
-from helpers.progress import ProgressBar
-from helpers.reinforce import Learner
 from helpers.rollout import rollout
 from helpers.session import Session
 from helpers.trajectories import Trajectories
@@ -64,13 +62,8 @@ def feature_sets(prepared: Prepared) -> Scores:
 def _matching(prepared: Prepared, session: Session, kept: tuple[int, ...]) -> LSTMPolicy:
     """The policy that Algorithm 2 learns when it knows these features only."""
     chosen = SomeFeatures(**vars(session.features), kept=kept)
-    variant, scale, n_epochs = session.variant_params, session.scale_params, session.epochs(session.params.case.offline.epochs)
-    policy, generator = stages.fresh_policy(session), session.stream("offline", session.variant)
-    learner = Learner(policy, session.process, chosen, variant.learner, scale.episodes, n_epochs, generator)
-    start = initial_weights(variant.weights, len(session.task.set_point), session.dtype)[list(kept)]
-    known = prepared.demonstrations.features(chosen)
-    bar, memory = ProgressBar(n_epochs, f"{len(kept)} features"), stages.memory(session, learner, known, start)
-    return maxent_irl(learner, known, start, variant.weights, n_epochs, scale.measured, bar, memory).policy
+    start = initial_weights(session.variant_params.weights, len(session.task.set_point), session.dtype)[list(kept)]
+    return stages.imitate(session, prepared.demonstrations, stages.fresh_policy(session), start, chosen).policy
 
 
 def record(session: Session, controller: Controller, purpose: str) -> stages.Demonstrations:

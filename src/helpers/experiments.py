@@ -6,7 +6,7 @@ whose experiment is not planned for the session's case (params/experiments.yaml)
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -22,13 +22,12 @@ from helpers.params import ComparisonParams, ExperimentCases, ExperimentParams, 
 from helpers.policy import LSTMPolicy, PolicyController
 from helpers.progress import ProgressBar
 from helpers.reinforce import (
-    EpochRecord,
     Learner,
     TrainingError,
     baseline_regressors,
     discounted_return,
     regression_advantage,
-    reinforce,
+    reinforce_in_rounds,
     surrogate,
 )
 from helpers.rollout import rollout
@@ -318,18 +317,7 @@ def learn_under(session: Session, weights: Tensor, n_epochs: int, label: str) ->
     policy = stages.fresh_policy(session)
     learner = Learner(policy, session.process, session.features, params, n_episodes, n_epochs, generator)
     reward = partial(apprentice_reward, features=session.features, weights=weights)
-    memory, earlier = stages.memory(session, learner, weights), list[EpochRecord]()
-    if (state := memory.recall()) is not None:
-        learner.restore(state["learner"])
-        earlier = [EpochRecord(**row) for row in state["records"]]
-
-    def state_of(records: Sequence[EpochRecord]) -> dict[str, Any]:
-        return {"learner": learner.state(), "records": [asdict(record) for record in records]}
-
-    def keep(records: Sequence[EpochRecord]) -> None:
-        memory.keep(partial(state_of, records), finished=len(records) == n_epochs)
-
-    reinforce(learner, reward, n_epochs, report=ProgressBar(n_epochs, label), earlier=earlier, keep=keep)
+    reinforce_in_rounds(learner, [(n_epochs, reward)], ProgressBar(n_epochs, label), stages.memory(session, learner, weights))
     return learner.average
 
 

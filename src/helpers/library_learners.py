@@ -50,7 +50,7 @@ class HeadStartPolicy(RecurrentActorCriticPolicy):
 
 
 class TrackingEnvs(VecEnv):
-    """Episodes side by side as the library wants them, stepped as one batch: a list of single environments is five times slower."""
+    """Episodes side by side as the library wants them, stepped as one batch and not one after the other."""
 
     def __init__(self, env: TrackingEnv, n_episodes: int) -> None:
         super().__init__(n_episodes, env.observation_space, env.action_space)

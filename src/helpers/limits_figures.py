@@ -67,7 +67,8 @@ def budget_curves(curves: pd.DataFrame, levels: Mapping[str, float]) -> Figure:
     """The objective against the plant episodes spent, a line for each learner, beside those that do not learn.
 
     Args:
-        curves: columns learner, episodes, objective, and seed where there are several; the line is then the median.
+        curves: columns learner, episodes, objective, and seed where there are several; the line is then the median and the band
+            around it holds the middle half of the seeds.
         levels: objectives of controllers that do not learn.
     """
     figure = empty_figure(WIDTH, 4.4)
@@ -75,9 +76,12 @@ def budget_curves(curves: pd.DataFrame, levels: Mapping[str, float]) -> Figure:
     markers = "osv^D*"
     names = [name for name in LEARNERS if name in set(curves["learner"])]
     for index, name in enumerate(names):
-        line = curves[curves["learner"] == name].groupby("episodes")["objective"].median()
+        spent = curves[curves["learner"] == name].groupby("episodes")["objective"]
+        low, line, high = (spent.quantile(share) for share in (0.25, 0.5, 0.75))
         style: dict[str, Any] = {"color": LOOP_COLOURS[index % len(LOOP_COLOURS)], "marker": markers[index % len(markers)]}
         axes.plot(line.index, line, label=LABELS[name], markersize=4, **style)
+        if (high > low).any():
+            axes.fill_between(line.index, low, high, color=style["color"], alpha=0.15, linewidth=0)
     known = [name for name in LEVELS if name in levels]
     for index, name in enumerate(known):
         style = {"color": MUTED, "linestyle": KIND_STYLES[index % len(KIND_STYLES)], "linewidth": 1.2}

@@ -174,8 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print("\n".join(outcome.sentences))
-    written = ["report.md", "policy.onnx", *(path.name for path in [given.output / "policy_transfer.onnx"] if path.is_file())]
-    print(f"written to {given.output}: {', '.join(written)}")
+    print(f"written: {given.output / 'report.md'}, its figures and policies beside it")
     return 0
 
 

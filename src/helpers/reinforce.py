@@ -332,12 +332,22 @@ def improve_online(
     report: Callable[[EpochRecord], None] = lambda record: None,
     memory: Memory | None = None,
 ) -> list[EpochRecord]:
-    """Online learning, Section 5.1.2: rounds of Algorithm 1 under the tracking objective, each with its own beta.
+    """Online learning, Section 5.1.2: rounds of Algorithm 1 under the tracking objective, each with its own beta."""
+    rewards = [partial(learner.features.tracking, beta=beta) for beta in betas]
+    return reinforce_in_rounds(learner, list(zip(epochs, rewards, strict=True)), report, memory)
+
+
+def reinforce_in_rounds(
+    learner: Learner,
+    rounds: Sequence[tuple[int, Reward]],
+    report: Callable[[EpochRecord], None] = lambda record: None,
+    memory: Memory | None = None,
+) -> list[EpochRecord]:
+    """Rounds of Algorithm 1, each of so many epochs under a reward of its own.
 
     With a memory it goes on where an interrupted run was.
     """
     memory = memory or NoMemory()
-    rounds = list(zip(epochs, betas, strict=True))
     finished: list[EpochRecord] = []  # records of earlier rounds
     started: list[EpochRecord] = []  # and of the interrupted one
     first = 0
@@ -357,9 +367,8 @@ def improve_online(
     def keep(index: int, records: Sequence[EpochRecord]) -> None:
         memory.keep(partial(state_of, index, records))
 
-    for index, (n_epochs, beta) in list(enumerate(rounds))[first:]:
-        tracking = partial(learner.features.tracking, beta=beta)
-        finished += reinforce(learner, tracking, n_epochs, learner.params.patience, report, started, partial(keep, index))
+    for index, (n_epochs, reward) in list(enumerate(rounds))[first:]:
+        finished += reinforce(learner, reward, n_epochs, learner.params.patience, report, started, partial(keep, index))
         started = []
     memory.keep(partial(state_of, len(rounds), []), finished=True)
     return finished

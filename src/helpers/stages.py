@@ -66,10 +66,16 @@ def load_policy(session: Session, stage: str, made_by: str, case: int | None = N
     return found.policy(session.params.learning, session.task), alpha
 
 
-def imitate(session: Session, demonstrations: Demonstrations, policy: LSTMPolicy, start: Tensor | None = None) -> Apprenticeship:
+def imitate(
+    session: Session,
+    demonstrations: Demonstrations,
+    policy: LSTMPolicy,
+    start: Tensor | None = None,
+    features: FeatureMap | None = None,
+) -> Apprenticeship:
     """Offline learning: Algorithm 2 from a policy and weights; without `start` the weights begin at their signs.
 
-    A policy that was trained before gets its initial exploration back.
+    A policy that was trained before gets its initial exploration back. `features`: those to match, if not the session's own.
     """
     variant, scale, offline = session.variant_params, session.scale_params, session.params.case.offline
     n_epochs = session.epochs(offline.epochs)
@@ -78,8 +84,8 @@ def imitate(session: Session, demonstrations: Demonstrations, policy: LSTMPolicy
         start = initial_weights(variant.weights, len(session.task.set_point), session.dtype)
     policy.reset_exploration(variant.exploration)
     generator = session.stream("offline", session.params.base(session.variant))
-    learner = Learner(policy, session.process, session.features, variant.learner, scale.episodes, n_epochs, generator)
-    expert_features = demonstrations.features(session.features)
+    learner = Learner(policy, session.process, features or session.features, variant.learner, scale.episodes, n_epochs, generator)
+    expert_features = demonstrations.features(learner.features)
     return maxent_irl(
         learner,
         expert_features,

@@ -31,12 +31,14 @@ def results(root, tmp_path):
 
 def write(folder, level):
     """What notebook 06 writes, in small: the gap of the MPC and every other number follow from `level`."""
-    names = ["expert", "mpc", "dynamic_programme"]
-    gaps = pd.DataFrame({"beta": 30.0, "controller": names, "objective": [10.0, 19.0, 20.0], "gap": [50.0, level, 0.0]})
+    names = ["expert", "mpc", "minimum_variance", "minimum_variance_filtered", "irl_reinforce", "dynamic_programme"]
+    objectives, below = [10.0, 19.0, 18.0, 18.5, level, 20.0], [50.0, level, 10.0, 7.5, 8.0, 0.0]
+    gaps = pd.DataFrame({"beta": 30.0, "controller": names, "objective": objectives, "gap": below})
     gaps = gaps.assign(gap_low=gaps["gap"] - 1, gap_high=gaps["gap"] + 1, low=0.0, high=0.0)
     save_stage(folder / "limits_attainable", {}, {"gaps.csv": gaps})
     curves = pd.DataFrame({"learner": ["mpc", "ppo", "ppo"], "episodes": [0, 0, 500], "objective": [19.0, 1.0, level]})
-    budget = pd.DataFrame({"learner": ["mpc", "ppo"], "0": [19.0, 1.0], "500": [19.0, level]})
+    objectives = {"0": [19.0, 1.0, 15.0], "500": [19.0, level, level + 2]}
+    budget = pd.DataFrame({"learner": ["mpc", "ppo", "irl_reinforce"], **objectives})
     save_stage(folder / "limits_budget", {}, {"curves.csv": curves, "budget.csv": budget})
     quality = pd.DataFrame({"controller": "mpc", "figure": ["iae:T", "settling_time_5:T", "itae:T"], "value": [level, None, 1.0]})
     save_stage(folder / "limits_quality", {}, {"quality.csv": quality})
@@ -50,6 +52,7 @@ def write(folder, level):
 def test_nothing_where_it_was_not_run(results):
     assert limits_report.tabulate(results(1, written=False)) == {}
     assert limits_report.draw(results(1, written=False)) == {}
+    assert limits_report.answers(results(1, written=False)) == {}
 
 
 def test_one_seed_shows_its_monte_carlo_interval(results):
@@ -70,9 +73,22 @@ def test_several_seeds_show_medians(results):
     found = limits_report.tabulate(results(3))
     assert found["limits_gaps"].set_index("controller").loc["offset-free MPC"].tolist() == ["11.0", "21.0"]
     figures = limits_report.draw(results(3))
-    assert set(figures) == {f"limits_{name}_case_{case}" for name in ("budget", "gaps") for case in (1, 2)}
+    assert set(figures) == {f"limits_{name}_case_{case}" for name in ("budget", "gaps", "model") for case in (1, 2)}
     line = next(line for line in figures["limits_budget_case_1"].axes[0].lines if line.get_label() == "PPO from scratch")
     assert line.get_ydata().tolist() == [1.0, 11.0]
+
+
+@pytest.mark.parametrize(("seeds", "word"), [(1, "too few seeds"), (5, "ahead")])
+def test_the_papers_way_beside_its_rivals(results, seeds, word):
+    pairs = limits_report.tabulate(results(seeds))["limits_pairs"].set_index(["case", "rival"])
+    assert pairs.loc[("I", "PPO from scratch")].tolist() == ["14.00", "2.00", word]
+
+
+def test_what_a_practitioner_reads(results):
+    found = limits_report.answers(results(3))
+    assert "after 500 episodes IRL, then REINFORCE is best, $J$ = 13.0" in found[1]
+    assert "passes offset-free MPC at none of these budgets" in found[1]
+    assert "passes offset-free MPC from 500 episodes on" in found[2]
 
 
 def test_the_section_of_the_template(results):
@@ -82,7 +98,8 @@ def test_the_section_of_the_template(results):
     environment = Environment(loader=FileSystemLoader("."), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"table": to_markdown, "numeral": lambda case: "I" * case}
     run = results(1)
-    rendered = environment.from_string(section).render(tables=limits_report.tabulate(run), cases=run.params, n_seeds=1)
+    shown = {"tables": limits_report.tabulate(run), "answers": limits_report.answers(run), "cases": run.params, "n_seeds": 1}
+    rendered = environment.from_string(section).render(shown)
     assert "10.0 [9.0, 11.0]" in rendered
     assert "figures/limits_budget_case_2.svg" in rendered
     assert environment.from_string(section).render(tables={}, cases=run.params, n_seeds=1).strip() == ""

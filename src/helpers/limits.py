@@ -7,7 +7,7 @@ import pandas as pd
 from IPython.display import Markdown
 from torch import Tensor
 
-from helpers import stages
+from helpers import limits_answer, stages
 from helpers.attainable import Optimum, Resolution, Tabulated, dynamic_programme, grid_around
 from helpers.control_quality import harris_index, quality
 from helpers.controllers import Controller
@@ -21,7 +21,6 @@ from helpers.session import Session
 from helpers.trajectories import Trajectories
 
 NORMAL = 1.96  # half the width of a 95 % interval, in standard errors
-NO_LEARNERS = ("clone", "mpc")
 ON_STATE = ("minimum_variance_x", "dynamic_programme")  # full information: they are given x in place of y
 
 
@@ -143,30 +142,12 @@ def _gap(values: Tensor, best: Tensor) -> dict[str, float]:
 
 
 def answer(gaps: pd.DataFrame, budget: pd.DataFrame, contest: Contest) -> Markdown:
-    """What a practitioner can read off the numbers, in words; every number comes from the tables.
+    """What a practitioner can read off the numbers of this case and seed, in words.
 
     Args:
         gaps: of `gaps`; budget: of `equal_budget.at_budgets`.
     """
-    found = gaps[gaps["beta"] == contest.beta].set_index("controller")
-    learners = budget.drop(index=[name for name in NO_LEARNERS if name in budget.index])
-    names = {name: name.replace("_", " ") for name in found.index}
-    lines = []
-    for episodes in budget.columns:
-        best = learners[episodes].idxmax()
-        lines.append(
-            f"after {episodes:,} plant episodes {names[best]} is the best learner, $J$ = {learners.loc[best, episodes]:.1f}"
-        )
-    model = {name: found.loc[name] for name in ("mpc", "minimum_variance", "minimum_variance_filtered")}
-    known = ", ".join(f"{names[name]} {row['objective']:.1f} ({row['gap']:.1f} %)" for name, row in model.items())
-    ahead = learners.columns[(learners > found.loc["mpc", "objective"]).any()]
-    passed = f"from {ahead[0]:,} episodes on" if len(ahead) else "at none of these budgets"
-    best = learners.iloc[:, -1].idxmax()
-    return Markdown(
-        f"**Without a model**, {'; '.join(lines)}. **With the exact model** and no episode at all (in brackets the gap to the "
-        f"programme): {known}. A learner passes offset-free MPC {passed}. The best learner ends {found.loc[best, 'gap']:.1f} % "
-        f"below the programme, the demonstrator stands {found.loc['expert', 'gap']:.1f} % below it."
-    )
+    return Markdown(limits_answer.answer(gaps[gaps["beta"] == contest.beta].set_index("controller"), budget))
 
 
 # Control quality -----------------------------------------------------------------------------------------------------

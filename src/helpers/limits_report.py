@@ -2,18 +2,22 @@
 
 from collections.abc import Callable
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
 from helpers import scorecard
 from helpers.artifacts import RECORD, load_stage
 from helpers.collection import DEMONSTRATIONS, Results
-from helpers.limits_figures import LABELS, budget_curves, gap_figure
+from helpers.limits_answer import answer
+from helpers.limits_figures import LABELS, budget_curves, gap_figure, heat_maps
 from helpers.tables import ROMAN, spread
 
 PLACES = 4  # digits after the point that count
 FIGURES = ("iae", "iae_worst", "offset", "overshoot", "settling_time_5", "total_variation", "at_bound", "harris")
 GROUPS = {"model": "model", "noise": "noise", "set_point": "set points", "time": "dead time and load"}
+THE_PAPERS = "irl_reinforce"
+RIVALS = ("clone_reinforce", "scratch_reinforce", "ppo", "recurrent_ppo", "pid_tuned")
 RUNS = {"hot": "hot start", "scratch": "from scratch"}
 
 
@@ -50,6 +54,7 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     return {
         "limits_gaps": _gaps(gaps),
         "limits_budget": _wide(listed.rename(columns={"learner": "controller"}), int, "J after {:,}", decimals=2),
+        "limits_pairs": _pairs(listed),
         "limits_robustness": _wide(worst.rename(columns={"group": "metric"}), str, "{}", GROUPS, decimals=0),
         "limits_quality": _quality(quality[kept]),
         "limits_safety": _wide(safety.rename(columns={"run": "controller"}), str, "{}", names=RUNS),
@@ -71,6 +76,39 @@ def _gaps(gaps: pd.DataFrame) -> pd.DataFrame:
             found = _summary(rows.assign(metric="gap", value=rows["gap"])).set_index("stage")
         columns[column] = {name: spread(found.loc[name], decimals=1) for name in LABELS if name in found.index}
     return _labelled(pd.DataFrame(columns))
+
+
+def _pairs(listed: pd.DataFrame) -> pd.DataFrame:
+    """What the paper's learner has ahead of each rival at each budget, as differences within seeds, and a word on the last.
+
+    Args:
+        listed: columns case, seed, learner, metric (the budget), value.
+    """
+    wide = listed.pivot_table(index=["case", "seed", "metric"], columns="learner", values="value")
+    rivals = [name for name in RIVALS if name in wide and THE_PAPERS in wide]
+    if not rivals:
+        return pd.DataFrame()
+    ahead = wide[rivals].rsub(wide[THE_PAPERS], axis=0).melt(ignore_index=False, var_name="controller").reset_index()
+    table = _wide(ahead.astype({"metric": int}).sort_values("metric"), int, "after {:,}", decimals=2)
+    last = _summary(ahead[ahead["metric"].astype(int) == ahead["metric"].astype(int).max()])
+    known = [last["ci_low"] > 0, last["ci_high"] < 0, last["ci_low"].isna()]
+    last["word"] = np.select(known, ["ahead", "behind", "too few seeds"], "cannot tell")
+    verdicts = {(ROMAN[row.case - 1], LABELS[row.stage]): row.word for row in last.itertuples()}
+    table["in the end"] = [verdicts[key] for key in zip(table["case"], table["controller"], strict=True)]
+    return table.rename(columns={"controller": "rival"})
+
+
+def answers(results: Results) -> dict[int, str]:
+    """What a practitioner can read off the medians over seeds, a sentence or two for each case that notebook 06 was run for."""
+    gaps, budget = read(results, "attainable", "gaps.csv"), read(results, "budget", "budget.csv")
+    found = {}
+    for case in sorted(gaps["case"].unique()) if len(gaps) else ():
+        headline = results.params[case].case.online.headline_beta
+        own = gaps[(gaps["case"] == case) & (gaps["beta"] == headline)]
+        listed = budget[budget["case"] == case].drop(columns=["case", "seed"])
+        listed = listed.groupby("learner", sort=False).median().rename(columns=int)
+        found[int(case)] = answer(own.groupby("controller")[["objective", "gap"]].median(), listed)
+    return found
 
 
 def _wide(
@@ -108,10 +146,13 @@ def _labelled(table: pd.DataFrame) -> pd.DataFrame:
 def draw(results: Results) -> dict[str, Figure]:
     """The figures of the section by name, for each case that notebook 06 was run for."""
     curves, gaps = read(results, "budget", "curves.csv"), read(results, "attainable", "gaps.csv")
+    robust, place = read(results, "robustness", "robustness.csv"), ["group", "row", "column", "controller"]
     drawn = {}
     for case in sorted(gaps["case"].unique()) if len(gaps) else ():
         own = gaps[gaps["case"] == case].groupby(["beta", "controller"], as_index=False).median(numeric_only=True)
         levels = own[own["beta"] == results.params[case].case.online.headline_beta].set_index("controller")["objective"]
         drawn[f"limits_budget_case_{case}"] = budget_curves(curves[curves["case"] == case], levels)
         drawn[f"limits_gaps_case_{case}"] = gap_figure(own)
+        cells = robust[robust["case"] == case].groupby(place, as_index=False, sort=False)["objective"].median()
+        drawn[f"limits_model_case_{case}"] = heat_maps(cells, "model", list(cells["controller"].unique()))
     return drawn

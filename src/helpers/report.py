@@ -219,6 +219,7 @@ def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapp
         published=results.published,
         benchmarks=benchmarks,
         claims=scorecard.verdicts_of_claims(results.claims),
+        answers=limits_report.answers(results),
         listing=partial(scorecard.listing, tabulated["comparison"]),
         better=_better(results),
         nearer=scorecard.nearer_to_expert(tabulated["comparison"]),

@@ -129,17 +129,14 @@ def polish(problem: Problem, start: Vector, iterations: int, n_trajectories: int
     return Fit(problem.settings(found.x), found.x, float(2 * found.cost))
 
 
-def fit(problem: Problem, scale: IdentificationScaleParams) -> list[Fit]:
-    """The fits from random starts, best first. A start is the best of many random points."""
-    fits = []
-    for start in range(scale.starts):
-        generator = np.random.default_rng([problem.seed, start])
-        n_points = round(SCREENED * scale.evaluations)
-        points = generator.uniform(*STARTS, (n_points, len(problem.free)))
-        begin = min(points, key=lambda z: problem.loss(z, scale.draws_search))
-        found = search(problem, begin, scale.evaluations - n_points, scale.draws_search, generator)
-        fits.append(polish(problem, found, scale.iterations, scale.draws))
-    return sorted(fits, key=lambda found: found.loss)
+def fit(problem: Problem, scale: IdentificationScaleParams, start: int) -> Fit:
+    """The fit from one random start, which is the best of many random points; `start` numbers it."""
+    generator = np.random.default_rng([problem.seed, start])
+    n_points = round(SCREENED * scale.evaluations)
+    points = generator.uniform(*STARTS, (n_points, len(problem.free)))
+    begin = min(points, key=lambda z: problem.loss(z, scale.draws_search))
+    found = search(problem, begin, scale.evaluations - n_points, scale.draws_search, generator)
+    return polish(problem, found, scale.iterations, scale.draws)
 
 
 def refit(problem: Problem, values: Values, scale: IdentificationScaleParams) -> Fit:

@@ -4,14 +4,20 @@ Sampling time and bounds are fitted together with the gains of the demonstrator 
 once more at the sampling time and the bounds of the parameter files, which are round numbers.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
+from helpers import artifacts
+from helpers.checkpoint import Checkpoints
 from helpers.features import feature_names
-from helpers.identification import Fit, Problem, Profile, polish, profile, refit
+from helpers.identification import Fit, Problem, Profile, fit, polish, profile, refit
+from helpers.identity import digest
 from helpers.params import Params
 from helpers.randomness import stream
 from helpers.readings import GAINS, MAIN, READINGS, TIME, Key, Reading, Values, Vector, simulate
@@ -23,10 +29,14 @@ TWO_SIDED = ("T_E",)  # inputs whose bounds are fitted side by side; PID1 never 
 
 @dataclass(frozen=True)
 class Study:
-    """What every fit starts from: the session, and the sampling errors of the published rows at the settings of the files."""
+    """What every fit starts from: the session, and the sampling errors of the published rows at the settings of the files.
+
+    The search takes half an hour, so every fit and profile that is finished is kept: an interrupted run goes on behind the last.
+    """
 
     session: IdentificationSession
     sampling_error: Mapping[int, Vector]
+    finished: Checkpoints
 
     @property
     def first(self) -> str:
@@ -94,6 +104,37 @@ class Study:
         """Sampling time, bounds and gains of the first demonstrator."""
         return self.problem(self.first, shared=True)
 
+    def fit(self, problem: Problem) -> list[Fit]:
+        """The fits from random starts, best first."""
+        scale = self.session.scale_params
+        fits = [self._fitted(problem, partial(fit, problem, scale, start), start) for start in range(scale.starts)]
+        return sorted(fits, key=lambda found: found.loss)
+
+    def refit(self, problem: Problem, values: Values) -> Fit:
+        """The fit in reach of given settings."""
+        return self._fitted(problem, partial(refit, problem, values, self.session.scale_params), tuple(values.items()))
+
+    def profile(self, problem: Problem, best: Fit, key: Key, rise: float) -> Profile:
+        """The profile of one setting about the fit of a problem."""
+
+        def compute() -> dict[str, Vector]:
+            found = profile(problem, best, key, rise, self.session.scale_params)
+            return {"grid": found.grid, "losses": found.losses}
+
+        return Profile(**self._once(compute, _what(problem), key, rise))
+
+    def _fitted(self, problem: Problem, compute: Callable[[], Fit], *start: Any) -> Fit:
+        found = self._once(lambda: {"z": (fitted := compute()).z, "loss": np.array(fitted.loss)}, _what(problem), *start)
+        return Fit(problem.settings(found["z"]), found["z"], float(found["loss"]))
+
+    def _once(self, compute: Callable[[], Mapping[str, Vector]], *what: Any) -> dict[str, Vector]:
+        """Numbers that an interrupted run has left, or else what is computed now."""
+        place = self.finished.of(*what)
+        if (state := place.recall()) is None:
+            state = {name: values.tolist() for name, values in compute().items()}
+            place.keep(partial(dict, state), finished=True)
+        return {name: np.array(values) for name, values in state.items()}
+
     def best(self, problem: Problem, fits: Sequence[Fit]) -> Fit:
         """The best of several fits, polished on many draws to a finer tolerance."""
         scale = self.session.scale_params
@@ -120,9 +161,24 @@ class Study:
         )
 
 
+def _what(problem: Problem) -> tuple[Any, ...]:
+    """What tells one problem of a run from another."""
+    return tuple(problem.cases), problem.free, problem.fixed, problem.reading, problem.overshoot_unit
+
+
 def study(session: IdentificationSession) -> Study:
     """What every fit starts from."""
-    return Study(session, sampling_errors(session, MAIN))
+    folder = session.output_root / session.scale / f"seed_{session.seed}" / f".checkpoints_{session.notebook}"
+    interval = next(iter(session.params.values())).learning.scales[session.scale].checkpoint_interval
+    finished = Checkpoints(folder, digest([session.made_from, session.seed, session.scale]), interval)
+    return Study(session, sampling_errors(session, MAIN), finished)
+
+
+def save(study: Study, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, Figure]) -> artifacts.Stage:
+    """Write the results; fits and profiles that were kept on the way are removed."""
+    stage = study.session.save(tables, figures)
+    study.finished.remove()
+    return stage
 
 
 def sampling_errors(session: IdentificationSession, reading: Reading) -> dict[int, Vector]:
@@ -166,11 +222,11 @@ def compare_readings(study: Study, joint: Fit, second: Fit) -> pd.DataFrame:
     for reading in READINGS:
         errors = sampling_errors(session, reading)
         problem = replace(study.problem(study.first, shared=True, reading=reading), sampling_error=errors)
-        found = refit(problem, start, scale)
+        found = study.refit(problem, start)
         shared = {key: value for key, value in found.settings.items() if key[0] not in GAINS}
         other = replace(study.problem(study.second, reading=reading), fixed=shared, sampling_error=errors)
         row: dict[str, object] = {"reading": reading.name}
-        for target, best in ((problem, found), (other, refit(other, second.settings, scale))):
+        for target, best in ((problem, found), (other, study.refit(other, second.settings))):
             tables = [study.compared(case, best.settings, scale.draws, "readings", reading) for case in target.cases]
             wider = sum(2 * np.log(errors[case] / study.sampling_error[case]).sum() for case in target.cases)
             row["loss_" + "_".join(str(session.published[case].table) for case in target.cases)] = best.loss + wider
@@ -201,7 +257,7 @@ def profiles(study: Study, joint: Fit, gains: Mapping[str, Fit], rise: float) ->
     found: dict[str, Profile] = {}
     for prefix, problem, best, keys in plans:
         polished = polish(problem, problem.position(best.settings), scale.iterations, scale.draws)
-        found |= {f"{prefix}{key[0]} {key[1]}": profile(problem, polished, key, rise, scale) for key in keys}
+        found |= {f"{prefix}{key[0]} {key[1]}": study.profile(problem, polished, key, rise) for key in keys}
     return found
 
 
@@ -231,7 +287,7 @@ def predictions(study: Study, gains: Mapping[str, Fit]) -> pd.DataFrame:
             problem = study.problem(name)
             for case in cases:
                 alone = replace(problem, cases={case: session.params[case]})
-                sources.append((f"Table {session.published[case].table}", cases, refit(alone, best.settings, scale).settings))
+                sources.append((f"Table {session.published[case].table}", cases, study.refit(alone, best.settings).settings))
     frames = [
         study.compared(case, values, scale.fresh, "fresh").assign(fitted_on=name)
         for name, cases, values in sources

@@ -78,7 +78,7 @@ def test_five_random_kills_lose_nothing_and_change_nothing(small):
     part = replace(place, targets=KILLED)
     expected = {name: content for name, content in expected.items() if "online" not in name}
     seed = random.SystemRandom().randrange(10**6)
-    tally = survive(part, expected, 2 / 3 * seconds, kills=5, seed=seed)
+    tally = survive(part, expected, seconds / 3, kills=5, seed=seed)
     assert sum(tally.kills.values()) == 5, (seed, tally)
     assert (tally.lost, tally.differing, tally.left) == (0, 0, 0), (seed, tally)
     assert tally.rounds >= 1

@@ -57,9 +57,9 @@ bench: setup  ## measure speed against the machine's bound and other ways; write
 torture: setup  ## kill a run KILLS times, crowd notebooks, feed nonsense; writes reports/reference/reliability.md
 	$(BIN)/python -m torture.torture --kills $(KILLS)
 
-cluster: setup  ## as root on Debian: install SLURM, run the smoke scale through it, compare, stop it
+cluster: setup  ## as root on Debian: install SLURM, run the smoke scale through it, compare, stop it (ACCOUNTING=1: with a database)
 	$(BIN)/python -m pip install --quiet --constraint environment.txt --editable ".[slurm]"
-	$(BIN)/python -m torture.cluster
+	$(BIN)/python -m torture.cluster $(if $(ACCOUNTING),--accounting)
 
 publish: setup  ## copy reports/latest to reports/reference
 	$(BIN)/python -m helpers.publish

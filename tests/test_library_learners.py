@@ -10,12 +10,14 @@ pytest.importorskip("sb3_contrib")
 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
+from helpers import equal_budget, limits, stages  # noqa: E402
 from helpers.features import tracking_reward  # noqa: E402
 from helpers.gym_environment import TrackingEnv  # noqa: E402
 from helpers.library_learners import HeadStartPolicy, LibraryController, TrackingEnvs, learn, library_learner  # noqa: E402
 from helpers.limits_params import load_limits  # noqa: E402
 from helpers.randomness import stream  # noqa: E402
 from helpers.rollout import rollout  # noqa: E402
+from helpers.session import open_session  # noqa: E402
 
 
 @pytest.fixture
@@ -110,3 +112,19 @@ def test_learners_learn_and_become_controllers(study, root, name):
     assert batch.u.isfinite().all()
     again = rollout(case.process, controller, case.task, 3, stream(0, "library"))
     assert torch.equal(batch.u, again.u)  # its mode, from a fresh state
+
+
+@pytest.mark.parametrize("name", ["ppo", "recurrent_ppo"])
+def test_an_interrupted_run_does_not_repeat_a_learner_that_has_ended(root, tmp_path, monkeypatch, name):
+    given = {"case": 2, "seed": 0, "scale": "smoke", "params_root": str(root), "input_root": "", "output_root": str(tmp_path)}
+    contest = limits.enter(open_session("06_limits_and_alternatives", given))
+    scale = contest.scale.model_copy(update={"episodes": 100, "every": 50, "judged": 20})
+    contest = equal_budget.Contest(contest.prepared, contest.params.model_copy(update={"scales": {"smoke": scale}}))
+    contest.session.checkpoints.interval = 0.0
+    first = equal_budget.from_library(contest, name)
+    monkeypatch.setattr("helpers.library_learners.learn", None)
+    again = equal_budget.from_library(contest, name)
+    assert [episodes for episodes, *_ in first.curve] == [0, 50, 100]
+    assert again.curve == first.curve
+    one, other = (stages.fresh_trajectories(contest.session, found.build(contest.session), 20).u for found in (first, again))
+    assert torch.equal(one, other)

@@ -163,7 +163,7 @@ def retuned(contest: Contest) -> Learned:
 
 
 def from_library(contest: Contest, name: str) -> Learned:
-    """PPO or RecurrentPPO from scratch.
+    """PPO or RecurrentPPO from scratch; an interrupted run does not repeat one that has ended.
 
     Raises:
         PackageError: if the extra `alternatives` is not installed.
@@ -188,7 +188,13 @@ def from_library(contest: Contest, name: str) -> Learned:
         if visitor.due(episodes):
             visitor(episodes, build(session))
 
-    library.learn(model, session.task, contest.scale.episodes, partial(contest.sharpness, dense=True), visit)
+    memory = session.checkpoint("library", name)
+    if (state := memory.recall()) is None:
+        library.learn(model, session.task, contest.scale.episodes, partial(contest.sharpness, dense=True), visit)
+        memory.keep(lambda: {"policy": model.policy.state_dict(), "curve": visitor.curve}, finished=True)
+    else:
+        model.policy.load_state_dict(state["policy"])
+        visitor.curve = [(int(episodes), *judged) for episodes, *judged in state["curve"]]
     return Learned(build, visitor.curve)
 
 

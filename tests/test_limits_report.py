@@ -44,7 +44,9 @@ def write(folder, level):
     save_stage(folder / "limits_quality", {}, {"quality.csv": quality})
     cells = [("model", row, "1", name, value) for row in "12" for name, value in (("expert", 10.0), ("mpc", 10.0 * int(row)))]
     robust = pd.DataFrame(cells, columns=["group", "row", "column", "controller", "objective"]).assign(standard_error=0.0)
-    save_stage(folder / "limits_robustness", {}, {"robustness.csv": robust})
+    names = ["expert", "online_there"]
+    improved = pd.DataFrame({"state": 1.3, "input": 0.7, "controller": names, "objective": [1.0, level]})
+    save_stage(folder / "limits_robustness", {}, {"robustness.csv": robust, "improved.csv": improved})
     safety = pd.DataFrame({"run": ["hot", "scratch"], "worst": [level, 0.0], "worse": [0.5, 1.0]})
     save_stage(folder / "limits_safety", {}, {"safety.csv": safety})
 
@@ -78,10 +80,16 @@ def test_several_seeds_show_medians(results):
     assert line.get_ydata().tolist() == [1.0, 11.0]
 
 
-@pytest.mark.parametrize(("seeds", "word"), [(1, "too few seeds"), (5, "ahead")])
-def test_the_papers_way_beside_its_rivals(results, seeds, word):
-    pairs = limits_report.tabulate(results(seeds))["limits_pairs"].set_index(["case", "rival"])
-    assert pairs.loc[("I", "PPO from scratch")].tolist() == ["14.00", "2.00", word]
+def test_the_papers_way_beside_its_rivals(results):
+    pairs = limits_report.tabulate(results(1))["limits_pairs"].set_index(["case", "rival"])
+    assert pairs.loc[("I", "PPO from scratch")].tolist() == ["14.00", "2.00"]
+    assert limits_report.standings(results(1)) == {}
+    assert limits_report.standings(results(5)) == {0: {"ppo": {"ahead": [1, 2]}}, 500: {"ppo": {"ahead": [1, 2]}}}
+
+
+def test_the_plants_that_were_improved_on(results):
+    improved = limits_report.tabulate(results(1))["limits_improved"].set_index(["case", "controller"])
+    assert improved.loc[("II", "improved on that plant"), "A x 1.3, B x 0.7"] == "20.0"
 
 
 def test_what_a_practitioner_reads(results):
@@ -99,6 +107,7 @@ def test_the_section_of_the_template(results):
     environment.filters |= {"table": to_markdown, "numeral": lambda case: "I" * case}
     run = results(1)
     shown = {"tables": limits_report.tabulate(run), "answers": limits_report.answers(run), "cases": run.params, "n_seeds": 1}
+    shown |= {"standings": limits_report.standings(run), "fewest": 5}
     rendered = environment.from_string(section).render(shown)
     assert "10.0 [9.0, 11.0]" in rendered
     assert "figures/limits_budget_case_2.svg" in rendered

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
@@ -42,7 +41,10 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     if gaps.empty:
         return {}
     budget = read(results, "budget", "curves.csv").rename(columns={"learner": "controller", "objective": "value"})
-    listed = read(results, "budget", "budget.csv").melt(["case", "seed", "learner"], var_name="metric")
+    listed = _listed(results)
+    there = read(results, "robustness", "improved.csv")
+    plants = [f"A x {state:g}, B x {entry:g}" for state, entry in zip(there["state"], there["input"], strict=True)]
+    there = there.assign(metric=plants).rename(columns={"objective": "value"})
     robust = read(results, "robustness", "robustness.csv")
     expert = robust[robust["controller"] == "expert"].drop(columns=["controller", "standard_error"])
     paired = robust.merge(expert, on=["case", "seed", "group", "row", "column"], suffixes=("", "_expert"))
@@ -54,8 +56,9 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     return {
         "limits_gaps": _gaps(gaps),
         "limits_budget": _wide(listed.rename(columns={"learner": "controller"}), int, "J after {:,}", decimals=2),
-        "limits_pairs": _pairs(listed),
+        "limits_pairs": _wide(_ahead(listed), int, "after {:,}", decimals=2).rename(columns={"controller": "rival"}),
         "limits_robustness": _wide(worst.rename(columns={"group": "metric"}), str, "{}", GROUPS, decimals=0),
+        "limits_improved": _wide(there, str, "{}", decimals=1),
         "limits_quality": _quality(quality[kept]),
         "limits_safety": _wide(safety.rename(columns={"run": "controller"}), str, "{}", names=RUNS),
     } | ({"limits_curves": budget} if len(budget) else {})
@@ -78,24 +81,34 @@ def _gaps(gaps: pd.DataFrame) -> pd.DataFrame:
     return _labelled(pd.DataFrame(columns))
 
 
-def _pairs(listed: pd.DataFrame) -> pd.DataFrame:
-    """What the paper's learner has ahead of each rival at each budget, as differences within seeds, and a word on the last.
+def _ahead(listed: pd.DataFrame) -> pd.DataFrame:
+    """How far the paper's learner is ahead of each rival within a seed: columns case, seed, metric (the budget), controller, value.
 
     Args:
         listed: columns case, seed, learner, metric (the budget), value.
     """
-    wide = listed.pivot_table(index=["case", "seed", "metric"], columns="learner", values="value")
+    wide = listed.astype({"metric": int}).pivot_table(index=["case", "seed", "metric"], columns="learner", values="value")
     rivals = [name for name in RIVALS if name in wide and THE_PAPERS in wide]
-    if not rivals:
-        return pd.DataFrame()
-    ahead = wide[rivals].rsub(wide[THE_PAPERS], axis=0).melt(ignore_index=False, var_name="controller").reset_index()
-    table = _wide(ahead.astype({"metric": int}).sort_values("metric"), int, "after {:,}", decimals=2)
-    last = _summary(ahead[ahead["metric"].astype(int) == ahead["metric"].astype(int).max()])
-    known = [last["ci_low"] > 0, last["ci_high"] < 0, last["ci_low"].isna()]
-    last["word"] = np.select(known, ["ahead", "behind", "too few seeds"], "cannot tell")
-    verdicts = {(ROMAN[row.case - 1], LABELS[row.stage]): row.word for row in last.itertuples()}
-    table["in the end"] = [verdicts[key] for key in zip(table["case"], table["controller"], strict=True)]
-    return table.rename(columns={"controller": "rival"})
+    return wide[rivals].rsub(wide.get(THE_PAPERS), axis=0).melt(ignore_index=False, var_name="controller").reset_index().dropna()
+
+
+def standings(results: Results) -> dict[int, dict[str, dict[str, list[int]]]]:
+    """By budget and rival: the cases in which the paper's learner is ahead of it, behind it, or where the seeds cannot tell.
+
+    Cases with too few seeds for an interval are left out.
+    """
+    listed = _listed(results)
+    ahead = _ahead(listed) if len(listed) else listed
+    found: dict[int, dict[str, dict[str, list[int]]]] = {}
+    for row in _summary(ahead).dropna(subset="ci_low").itertuples() if len(ahead) else ():
+        word = "ahead" if row.ci_low > 0 else "behind" if row.ci_high < 0 else "not to be told apart"
+        found.setdefault(row.metric, {}).setdefault(row.stage, {}).setdefault(word, []).append(row.case)
+    return dict(sorted(found.items()))
+
+
+def _listed(results: Results) -> pd.DataFrame:
+    budget = read(results, "budget", "budget.csv")
+    return budget.melt(["case", "seed", "learner"], var_name="metric") if len(budget) else budget
 
 
 def answers(results: Results) -> dict[int, str]:

@@ -220,6 +220,7 @@ def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapp
         benchmarks=benchmarks,
         claims=scorecard.verdicts_of_claims(results.claims),
         answers=limits_report.answers(results),
+        standings=limits_report.standings(results),
         listing=partial(scorecard.listing, tabulated["comparison"]),
         better=_better(results),
         nearer=scorecard.nearer_to_expert(tabulated["comparison"]),

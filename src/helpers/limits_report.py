@@ -120,7 +120,8 @@ def answers(results: Results) -> dict[int, str]:
         own = gaps[(gaps["case"] == case) & (gaps["beta"] == headline)]
         listed = budget[budget["case"] == case].drop(columns=["case", "seed"])
         listed = listed.groupby("learner", sort=False).median().rename(columns=int)
-        found[int(case)] = answer(own.groupby("controller")[["objective", "gap"]].median(), listed)
+        learned = listed[[episodes for episodes in listed if episodes]]  # nobody has learned from none
+        found[int(case)] = answer(own.groupby("controller")[["objective", "gap"]].median(), learned)
     return found
 
 

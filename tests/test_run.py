@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 from pathlib import Path
 
 import nbformat
@@ -49,6 +50,16 @@ def toy(monkeypatch, here):
         monkeypatch.setattr(run, "NOTEBOOKS", here / "notebooks")
 
     return write
+
+
+def test_a_warning_in_an_executed_copy_names_no_folder_of_the_machine(tmp_path):
+    path = tmp_path / "copy.ipynb"
+    text = f"{sysconfig.get_path('purelib')}/package/file.py:1: UserWarning: {PROJECT}/src/helpers/run.py\n"
+    cell = nbformat.v4.new_code_cell("warn()", outputs=[nbformat.v4.new_output("stream", name="stderr", text=text)])
+    nbformat.write(nbformat.v4.new_notebook(cells=[cell]), path)
+    run.strip_machine(path)
+    said = nbformat.read(path, as_version=4).cells[0].outputs[0].text
+    assert said == "package/file.py:1: UserWarning: src/helpers/run.py\n"
 
 
 def test_a_notebook_runs_from_any_directory_and_leaves_no_trace_of_the_machine(here, capfd):

@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import sys
+import sysconfig
 import tempfile
 import time
 from collections.abc import Sequence
@@ -111,6 +112,9 @@ def strip_machine(path: Path) -> None:
             cell.metadata["tags"] = tags
         else:
             cell.metadata.pop("tags", None)
+        for output in cell.get("outputs", []):
+            if output.output_type == "stream":  # a warning names the file of a package
+                output.text = output.text.replace(f"{sysconfig.get_path('purelib')}/", "").replace(f"{PROJECT}/", "")
     nbformat.write(notebook, path)
 
 

@@ -192,6 +192,26 @@ def test_features_that_differ_and_lie_nearer_to_the_printed_expert_are_counted()
     assert scorecard.nearer_to_expert(table) == 0
 
 
+def test_settings_fitted_to_one_table_predict_the_other():
+    columns = ["fitted_on", "table", "deviation", "relative_error"]
+    prediction = pd.DataFrame(
+        [
+            ["Table 2 and 4", 2, 1.0, 0.01],
+            ["Table 2 and 4", 2, -3.0, -0.03],
+            ["Table 2", 2, 0.5, 0.01],
+            ["Table 2", 4, 2.0, -0.04],
+            ["parameter files", 4, 2.0, 0.02],
+        ],
+        columns=columns,
+    )
+    found = scorecard.held_out(prediction)
+    assert found["role"].tolist() == ["fit", "fit", "prediction", "fit"]
+    first = found.iloc[0]
+    assert first["mean_error, %"] == pytest.approx(2.0)
+    assert first["greatest_error, %"] == pytest.approx(3.0)
+    assert first["greatest_deviation"] == 3.0
+
+
 def test_claims_are_put_together_over_cases_and_quantities():
     rows = [
         ("a", 1, "holds"),

@@ -117,6 +117,7 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     if results.inferred is not None:
         for name in ("settings", "hypotheses", "prediction"):
             tabulated[f"inferred_{name}"] = results.inferred.table(f"{name}.csv")
+        tabulated["inferred_errors"] = scorecard.held_out(tabulated["inferred_prediction"])
     return tabulated | limits_report.tabulate(results)
 
 

@@ -179,6 +179,32 @@ def nearer_to_expert(compared: pd.DataFrame) -> int:
     return int((nearer & (policy["verdict"] == "differs")).sum())
 
 
+def held_out(prediction: pd.DataFrame) -> pd.DataFrame:
+    """How far the settings fitted to some tables reproduce each table: a row for each pair of them.
+
+    Columns: fitted_on, table, role (fit or prediction), mean_error and greatest_error (of the features, in per cent),
+    greatest_deviation (in sampling errors of a published feature).
+
+    Args:
+        prediction: columns fitted_on, table, deviation and relative_error of each feature, on trajectories that no fit has seen.
+    """
+    rows = []
+    for (fitted_on, table), features in prediction.groupby(["fitted_on", "table"], sort=False):
+        fitted = fitted_on == "parameter files" or str(table) in fitted_on.removeprefix("Table ").split(" and ")
+        errors = 100 * features["relative_error"].abs()
+        rows.append(
+            {
+                "fitted_on": fitted_on,
+                "table": table,
+                "role": "fit" if fitted else "prediction",
+                "mean_error, %": errors.mean(),
+                "greatest_error, %": errors.max(),
+                "greatest_deviation": features["deviation"].abs().max(),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
 def verdicts_of_claims(claims: pd.DataFrame) -> dict[str, list[str]]:
     """The claims, each with its section, by what all its cases and quantities say together.
 

@@ -97,6 +97,7 @@ def test_verdicts_of_a_difference_below(values, verdict, shift):
     mirrored = judge(claim("difference_above"), paired(np.subtract(shift, values), shift))
     assert mirrored.verdict == verdict
     assert mirrored.median == pytest.approx(-found.median, nan_ok=True)
+    assert (found.reason == "a tie") == (values == [0, 0, 0, 0, 0])
 
 
 def test_margin_ratio_and_value():

@@ -50,9 +50,9 @@ README = "# Title\n<!-- glance: a -->\nold\n<!-- /glance -->\nmiddle\n<!-- time:
 
 
 GAPS = """\
-case,n_seeds,feature_gap,feature_gap_low,feature_gap_high,published_gap,expert_error,expert_error_low,expert_error_high,online_share
-1,20,0.2,0.15,0.31,0.1,0.01,0.009,0.012,0.951
-2,20,0.03,0.02,0.04,0.137,0.02,0.02,0.02,
+case,n_seeds,feature_gap,feature_gap_low,feature_gap_high,published_gap,expert_error,expert_error_low,expert_error_high,online_share,printed_gap
+1,20,0.2,0.15,0.31,0.1,0.01,0.009,0.012,0.951,0.4
+2,20,0.03,0.02,0.04,0.137,0.02,0.02,0.02,,
 """
 
 
@@ -110,8 +110,8 @@ def test_publishing_writes_the_numbers_into_readme(project):
     assert publish.main() == 0
     lines = (project / "README.md").read_text(encoding="utf-8").splitlines()
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith(("| I ", "| II "))]
-    assert rows[0] == ["I", "1.0 % [0.9, 1.2]", "10.0 %", "20.0 % [15.0, 31.0]", "95.1 %"]
-    assert rows[1] == ["II", "2.0 %", "13.7 %", "3.0 % [2.0, 4.0]", "–"]
+    assert rows[0] == ["I", "1.0 % [0.9, 1.2]", "10.0 %", "20.0 % [15.0, 31.0]", "40.0 %", "95.1 %"]
+    assert rows[1] == ["II", "2.0 %", "13.7 %", "3.0 % [2.0, 4.0]", "–", "–"]
     assert "(ours: medians and 95 % bootstrap intervals of the median over 20 seeds)" in lines
     assert any("offline_improved" in line and " 20 " in line for line in lines)
     kept = [line for line in lines if line in README.splitlines()]

@@ -214,23 +214,31 @@ def test_settings_fitted_to_one_table_predict_the_other():
 
 def test_claims_are_put_together_over_cases_and_quantities():
     rows = [
-        ("a", 1, "holds"),
-        ("a", 2, "holds"),
-        ("b", 1, "holds"),
-        ("b", 2, "does not hold"),
-        ("c", 1, "does not hold"),
-        ("c", 3, "cannot tell"),
-        ("d", 1, "holds"),
-        ("d", 1, "cannot tell"),
-        ("e", 1, "not comparable"),
-        ("f", 2, "does not hold"),
-        ("f", 2, "holds"),
+        ("a", 1, "x", "holds"),
+        ("a", 2, "x", "holds"),
+        ("b", 1, "x", "holds"),
+        ("b", 2, "x", "does not hold"),
+        ("c", 1, "x", "does not hold"),
+        ("c", 3, "x", "cannot tell"),
+        ("d", 1, "x", "holds"),
+        ("d", 1, "y", "cannot tell"),
+        ("e", 1, "", "not comparable"),
+        ("f", 2, "x", "does not hold"),
+        ("f", 2, "y", "holds"),
+        ("g", 3, "w", "holds"),
+        ("g", 3, "x", "does not hold"),
+        ("g", 3, "y", "does not hold"),
+        ("g", 3, "z", "does not hold"),
     ]
-    claims = pd.DataFrame(rows, columns=["id", "case", "verdict"]).assign(section="5.1")
+    claims = pd.DataFrame(rows, columns=["id", "case", "quantity", "verdict"]).assign(section="5.1")
     claims["statement"] = "the claim " + claims["id"]
     assert scorecard.verdicts_of_claims(claims) == {
         "holds": ["The claim a (5.1)"],
-        "holds in part": ["The claim b (5.1): not in Case Study II", "The claim f (5.1): not throughout"],
+        "holds in part": [
+            "The claim b (5.1): not for Case Study II",
+            "The claim f (5.1): not for Case Study II (x)",
+            "The claim g (5.1): not for Case Study III (3 of 4 quantities)",
+        ],
         "does not hold": ["The claim c (5.1)"],
         "cannot tell": ["The claim d (5.1)"],
         "not comparable": ["The claim e (5.1)"],

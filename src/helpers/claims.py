@@ -1,7 +1,8 @@
 """The claims of the paper: what params/claims.yaml says decides about each, and the verdict over seeds.
 
 The rule: a claim holds where the whole 95 % bootstrap interval of the median over seeds lies on the claimed side of the margin,
-does not hold where it lies wholly on the other side, and cannot be told otherwise, or with fewer than five seeds.
+does not hold where no part of it does (two that tie are no better than each other), and cannot be told otherwise, or with fewer
+than five seeds.
 """
 
 from collections.abc import Mapping, Sequence
@@ -132,7 +133,8 @@ def judge(claim: Claim, values: pd.DataFrame) -> Verdict:
     elif sign * nearest > sign * claim.margin:
         verdict, reason = HOLDS, f"the whole interval lies {side} {claim.margin:g}"
     elif sign * farthest <= sign * claim.margin:
-        verdict, reason = FAILS, f"no part of the interval lies {side} {claim.margin:g}"
+        tie = kind != "value" and low == high == claim.margin
+        verdict, reason = FAILS, "a tie" if tie else f"no part of the interval lies {side} {claim.margin:g}"
     else:
         verdict, reason = OPEN, f"the interval holds {claim.margin:g}"
     return Verdict(len(found), float(np.median(found)), low, high, verdict, reason)

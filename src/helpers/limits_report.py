@@ -8,12 +8,31 @@ from matplotlib.figure import Figure
 from helpers import scorecard
 from helpers.artifacts import RECORD, load_stage
 from helpers.collection import DEMONSTRATIONS, Results
-from helpers.limits_answer import answer
+from helpers.limits_answer import NO_LEARNERS, WITH_MODEL, answer
 from helpers.limits_figures import LABELS, budget_curves, gap_figure, heat_maps
-from helpers.tables import ROMAN, spread
+from helpers.statistics import FEWEST, median_interval
+from helpers.tables import ROMAN, spread, symbol
 
 PLACES = 4  # digits after the point that count
-FIGURES = ("iae", "iae_worst", "offset", "overshoot", "settling_time_5", "total_variation", "at_bound", "harris")
+FIGURES = {  # of control quality, with their units; the errors are normalised
+    "iae": "IAE (time)",
+    "iae_worst": "IAE, worst 5 % (time)",
+    "offset": "offset (share of the change)",
+    "overshoot": "overshoot (share of the change)",
+    "settling_time_5": "settling time, 5 % (time)",
+    "total_variation": "total variation (deviation)",
+    "at_bound": "at a bound (share of time)",
+    "harris": "Harris index",
+}
+SAFETY = {  # of the online epochs, with their units
+    "episodes": "episodes",
+    "worst": "worst episode ($J$)",
+    "worst_expert": "the PID's worst ($J$)",
+    "worse": "worse than the PID (share)",
+    "regret": "regret ($J$)",
+    "regret_episodes": "regret (episodes of the PID)",
+    "regret_peak": "greatest regret on the way ($J$)",
+}
 GROUPS = {"model": "model", "noise": "noise", "set_point": "set points", "time": "dead time and load"}
 THE_PAPERS = "irl_reinforce"
 RIVALS = ("clone_reinforce", "scratch_reinforce", "ppo", "recurrent_ppo", "pid_tuned")
@@ -45,11 +64,6 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     there = read(results, "robustness", "improved.csv")
     plants = [f"A x {state:g}, B x {entry:g}" for state, entry in zip(there["state"], there["input"], strict=True)]
     there = there.assign(metric=plants).rename(columns={"objective": "value"})
-    robust = read(results, "robustness", "robustness.csv")
-    expert = robust[robust["controller"] == "expert"].drop(columns=["controller", "standard_error"])
-    paired = robust.merge(expert, on=["case", "seed", "group", "row", "column"], suffixes=("", "_expert"))
-    worst = paired.assign(value=100 * paired["objective"] / paired["objective_expert"])
-    worst = worst.groupby(["case", "seed", "controller", "group"], as_index=False)["value"].min()
     quality = read(results, "quality", "quality.csv").rename(columns={"figure": "metric"})
     kept = quality["metric"].str.split(":").str[0].isin(FIGURES)
     safety = read(results, "safety", "safety.csv").melt(["case", "seed", "run"], var_name="metric")
@@ -57,11 +71,35 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
         "limits_gaps": _gaps(gaps),
         "limits_budget": _wide(listed.rename(columns={"learner": "controller"}), int, "J after {:,}", decimals=2),
         "limits_pairs": _wide(_ahead(listed), int, "after {:,}", decimals=2).rename(columns={"controller": "rival"}),
-        "limits_robustness": _wide(worst.rename(columns={"group": "metric"}), str, "{}", GROUPS, decimals=0),
+        "limits_robustness": _wide(_worst(results).rename(columns={"group": "metric"}), str, "{}", GROUPS, decimals=0),
         "limits_improved": _wide(there, str, "{}", decimals=1),
-        "limits_quality": _quality(quality[kept]),
-        "limits_safety": _wide(safety.rename(columns={"run": "controller"}), str, "{}", names=RUNS),
+        "limits_quality": _wide(quality[kept], str, "{}", {name: _figure_header(name) for name in quality["metric"].unique()}),
+        "limits_safety": _wide(safety.rename(columns={"run": "controller"}), str, "{}", SAFETY, RUNS),
     } | ({"limits_curves": budget} if len(budget) else {})
+
+
+def _worst(results: Results) -> pd.DataFrame:
+    """The least share of the PID's objective over each grid of conditions: case, seed, controller, group, value (per cent)."""
+    robust = read(results, "robustness", "robustness.csv")
+    expert = robust[robust["controller"] == "expert"].drop(columns=["controller", "standard_error"])
+    paired = robust.merge(expert, on=["case", "seed", "group", "row", "column"], suffixes=("", "_expert"))
+    shares = paired.assign(value=100 * paired["objective"] / paired["objective_expert"])
+    return shares.groupby(["case", "seed", "controller", "group"], as_index=False)["value"].min()
+
+
+def price(results: Results) -> dict[int, dict[str, float]]:
+    """What online improvement costs in each case, in per cent and medians over seeds; empty where notebook 06 was not run.
+
+    worse: the exploring episodes that were worse than the PID; set_point and model: the least share of the PID's objective that
+    the improved policy keeps at set points not trained on and on plants that are not the model.
+    """
+    safety = read(results, "safety", "safety.csv")
+    if safety.empty:
+        return {}
+    worse = 100 * safety[safety["run"] == "hot"].groupby("case")["worse"].median()
+    online = _worst(results).query("controller == 'online'")
+    worst = online.pivot_table(index="case", columns="group", values="value", aggfunc="median")
+    return worst.reindex(columns=["set_point", "model"]).assign(worse=worse).to_dict("index")
 
 
 def _summary(frame: pd.DataFrame) -> pd.DataFrame:
@@ -112,17 +150,57 @@ def _listed(results: Results) -> pd.DataFrame:
 
 
 def answers(results: Results) -> dict[int, str]:
-    """What a practitioner can read off the medians over seeds, a sentence or two for each case that notebook 06 was run for."""
+    """What a practitioner can read off, a sentence or two for each case that notebook 06 was run for.
+
+    Off the medians; with as many seeds as make an interval, learners are compared within seeds, and those that cannot be told
+    apart from the best are named.
+    """
     gaps, budget = read(results, "attainable", "gaps.csv"), read(results, "budget", "budget.csv")
     found = {}
     for case in sorted(gaps["case"].unique()) if len(gaps) else ():
         headline = results.params[case].case.online.headline_beta
         own = gaps[(gaps["case"] == case) & (gaps["beta"] == headline)]
-        listed = budget[budget["case"] == case].drop(columns=["case", "seed"])
-        listed = listed.groupby("learner", sort=False).median().rename(columns=int)
-        learned = listed[[episodes for episodes in listed if episodes]]  # nobody has learned from none
-        found[int(case)] = answer(own.groupby("controller")[["objective", "gap"]].median(), learned)
+        listed = budget[budget["case"] == case].drop(columns="case").set_index(["seed", "learner"]).rename(columns=int)
+        listed = listed[[episodes for episodes in listed if episodes]]  # nobody has learned from none
+        if own["seed"].nunique() < FEWEST:
+            medians = listed.groupby("learner", sort=False).median()
+            found[int(case)] = answer(own.groupby("controller")[["objective", "gap"]].median(), medians)
+        else:
+            found[int(case)] = _answer_over_seeds(own, listed)
     return found
+
+
+def _answer_over_seeds(own: pd.DataFrame, listed: pd.DataFrame) -> str:
+    """Who learns best, who cannot be told apart from it, and who passes the controllers that have the exact model instead.
+
+    Args:
+        own: columns seed, controller, objective, gap, of one case and beta.
+        listed: the objective after so many episodes (columns), index seed and learner.
+    """
+    reached = own.pivot_table(index="seed", columns="controller", values="objective")
+    best, passing = [], []
+    for episodes in listed:
+        learners = listed.pivot_table(index="seed", columns="learner", values=episodes)
+        learners = learners.drop(columns=list(NO_LEARNERS), errors="ignore")
+        first = learners.median().idxmax()
+        ahead = {name: _low(learners[first] - learners[name]) for name in learners if name != first}
+        tied = ", ".join(LABELS[name] for name, low in ahead.items() if low <= 0)
+        apart = f"not to be told apart from {tied}" if tied else "ahead of all others"
+        best.append(f"after {episodes:,} episodes {LABELS[first]}, $J$ = {learners[first].median():.1f} ({apart})")
+        passed = [LABELS[name] for name in learners if _low(learners[name] - reached["mpc"]) > 0]
+        passing.append(f"after {episodes:,} {', '.join(passed) or 'none'}")
+    medians = own.groupby("controller")[["objective", "gap"]].median()
+    known = ", ".join(f"{LABELS[name]} {medians['objective'][name]:.1f} ({medians['gap'][name]:.1f} %)" for name in WITH_MODEL)
+    return (
+        f"**Learning on the plant**, best in the median: {'; '.join(best)}. **With the exact model** and no episode at all (in "
+        f"brackets the gap to the programme): {known}; the demonstrator stands {medians['gap']['expert']:.1f} % below it. "
+        f"Learners ahead of offset-free MPC in the same seeds, by the whole interval: {'; '.join(passing)}."
+    )
+
+
+def _low(differences: pd.Series) -> float:
+    """The lower end of the interval of the median difference."""
+    return float(median_interval(differences.dropna().to_numpy())[0])
 
 
 def _wide(
@@ -143,13 +221,14 @@ def _wide(
                 cells = {metric: spread(numbers.reindex([(name, metric)]).iloc[0], decimals=decimals) for metric in order}
                 shown = {header.format(kind((words or {}).get(metric, metric))): cell for metric, cell in cells.items()}
                 rows.append({"case": ROMAN[case - 1], "controller": label} | shown)
-    return pd.DataFrame(rows).rename(columns=lambda column: column.replace("_", " "))
+    return pd.DataFrame(rows)
 
 
-def _quality(quality: pd.DataFrame) -> pd.DataFrame:
-    """A row for each case and controller, a column for each figure and variable."""
-    table = _wide(quality, str, "{}")
-    return table.rename(columns=lambda column: column.replace("settling time 5", "settling time"))
+def _figure_header(metric: str) -> str:
+    """A figure of control quality in words, with its variable and unit."""
+    figure, _, variable = metric.partition(":")
+    words, bracket, unit = FIGURES.get(figure, figure).partition(" (")
+    return f"{words}, {symbol(variable)}{bracket}{unit}"
 
 
 def _labelled(table: pd.DataFrame) -> pd.DataFrame:

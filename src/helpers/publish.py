@@ -58,6 +58,7 @@ def glance(gaps: pd.DataFrame) -> str:
         row["expert error"] = _percent(numbers, "expert_error")
         row["feature gap, paper"] = _percent(numbers, "published_gap")
         row["feature gap, ours"] = _percent(numbers, "feature_gap")
+        row["the same, algorithms as printed"] = _percent(numbers, "printed_gap")
         row["online objective, share of minimum variance"] = _percent(numbers, "online_share")
         rows.append(row)
     n_seeds = int(gaps["n_seeds"].min())

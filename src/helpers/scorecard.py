@@ -66,8 +66,9 @@ def gaps(medians: pd.DataFrame, published: Mapping[int, PublishedCase]) -> pd.Da
     """How near the learned policy comes to the expert, and how near online learning to minimum-variance control.
 
     Columns: case; n_seeds; feature_gap, its median, with the ends of its interval, the 90th percentile and the greatest;
-    published_gap, the mean of |v_pi - v_E| / |v_E| over the paper's own rows; expert_error and online_share, medians with the
-    ends of their intervals. All but the first two are shares of one; what no seed gave is nan.
+    published_gap, the mean of |v_pi - v_E| / |v_E| over the paper's own rows; printed_gap (of the algorithms as printed),
+    expert_error and online_share, medians with the ends of their intervals. All but the first two are shares of one; what no seed
+    gave is nan.
 
     Args:
         medians: of `summary`, with the rows of `relative`.
@@ -75,12 +76,12 @@ def gaps(medians: pd.DataFrame, published: Mapping[int, PublishedCase]) -> pd.Da
     rows = []
     for case, printed in published.items():
         by_number = medians[medians["case"] == case].set_index(["stage", "metric"])
-        wanted = [("offline", "feature_gap"), ("expert", "published_error"), ("online", "share")]
-        gap, error, share = (by_number.reindex([key]).iloc[0] for key in wanted)
+        wanted = {"offline": "feature_gap", "offline_printed": "feature_gap", "expert": "published_error", "online": "share"}
+        gap, as_printed, error, share = (by_number.reindex([key]).iloc[0] for key in wanted.items())
         row = {"case": case, "n_seeds": int(np.nan_to_num(gap["n_seeds"])), "feature_gap": gap["median"]}
         row |= {f"feature_gap_{name.removeprefix('ci_')}": gap[name] for name in ("ci_low", "ci_high", "p90", "greatest")}
         row["published_gap"] = printed.feature_gap
-        for name, ours in (("expert_error", error), ("online_share", share)):
+        for name, ours in (("printed_gap", as_printed), ("expert_error", error), ("online_share", share)):
             row |= {name: ours["median"], f"{name}_low": ours["ci_low"], f"{name}_high": ours["ci_high"]}
         rows.append(row)
     return pd.DataFrame(rows)
@@ -137,7 +138,7 @@ def comparison(
         for row, (stage, metric) in REPRODUCED_BY.items():
             for feature, value in zip(feature_names, getattr(printed, row), strict=True):
                 key = (case, stage, f"{metric}:{feature}")
-                if key not in runs:
+                if key not in found.index:
                     rows.append([printed.table, case, row, feature, value, np.nan, 0, *[np.nan] * 4, *verdict(row, value, 0, 0, 0)])
                     continue
                 lacking = 0.0
@@ -212,7 +213,7 @@ def verdicts_of_claims(claims: pd.DataFrame) -> dict[str, list[str]]:
     it fails somewhere and holds nowhere; otherwise one `cannot tell`, or it is `not comparable`.
 
     Args:
-        claims: columns id, section, statement, case, verdict.
+        claims: columns id, section, statement, case, quantity, verdict.
     """
     found: dict[str, list[str]] = {"holds": [], "holds in part": [], "does not hold": [], "cannot tell": [], "not comparable": []}
     for _, rows in claims.groupby("id", sort=False):
@@ -222,10 +223,18 @@ def verdicts_of_claims(claims: pd.DataFrame) -> dict[str, list[str]]:
         if len(verdicts) == 1:
             found[verdicts.pop()].append(text)
         elif {"holds", "does not hold"} <= verdicts:
-            failing = rows.loc[rows["verdict"] == "does not hold", "case"].unique()
-            one_case = len(set(rows["case"])) == 1
-            where = "throughout" if one_case else f"in Case Study {', '.join(ROMAN[case - 1] for case in failing)}"
-            found["holds in part"].append(f"{text}: not {where}")
+            found["holds in part"].append(f"{text}: not for {_failing(rows)}")
         else:
             found["does not hold" if "does not hold" in verdicts else "cannot tell"].append(text)
     return found
+
+
+def _failing(rows: pd.DataFrame) -> str:
+    """Where a claim fails: its cases, and which quantities, or how many, in a case in which others do not fail."""
+    places = []
+    for case, of_case in rows.groupby("case"):
+        failing = of_case.loc[of_case["verdict"] == "does not hold", "quantity"]
+        if len(failing):
+            named = "; ".join(failing) if len(failing) < 3 else f"{len(failing)} of {len(of_case)} quantities"
+            places.append(f"Case Study {ROMAN[case - 1]}{f' ({named})' if len(failing) < len(of_case) else ''}")
+    return ", ".join(places)

@@ -7,7 +7,8 @@ import pytest
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from helpers import limits_report
-from helpers.artifacts import save_stage
+from helpers.artifacts import load_stage, save_stage
+from helpers.collection import LIMITS
 from helpers.params import load
 from helpers.sources import PROJECT
 from helpers.tables import to_markdown
@@ -17,14 +18,13 @@ from helpers.tables import to_markdown
 def results(root, tmp_path):
     def build(seeds, written=True):
         params = {case: load(root, case) for case in (1, 2)}
-        stages = {}
+        limits = {}
         for case in params:
-            for seed in range(seeds):
+            for seed in range(seeds if written else 0):
                 folder = tmp_path / f"seed_{seed}/case_{case}"
-                stages[case, seed, "demonstrations"] = SimpleNamespace(folder=folder / "demonstrations")
-                if written:
-                    write(folder, 10.0 * case + seed)
-        return SimpleNamespace(params=params, stages=stages)
+                write(folder, 10.0 * case + seed)
+                limits |= {(case, seed, part): load_stage(folder / f"limits_{part}", "notebook 06") for part in LIMITS}
+        return SimpleNamespace(params=params, limits=limits)
 
     return build
 
@@ -118,6 +118,11 @@ def test_learners_that_cannot_be_told_apart():
     assert "after 100 episodes REINFORCE from scratch, $J$ = 5.0 (not to be told apart from PPO from scratch)" in told
 
 
+def test_the_ranges_of_the_grids(results):
+    assert limits_report.ranges(results(1, written=False)) == ""
+    assert limits_report.ranges(results(1)) == "A and B times 1 to 2 and 1 to 1"
+
+
 def test_the_price_of_improving(results):
     assert limits_report.price(results(1, written=False)) == {}
     found = limits_report.price(results(1))
@@ -133,7 +138,7 @@ def test_the_section_of_the_template(results):
     environment.filters |= {"table": to_markdown, "numeral": lambda case: "I" * case}
     run = results(1)
     shown = {"tables": limits_report.tabulate(run), "answers": limits_report.answers(run), "cases": run.params, "n_seeds": 1}
-    shown |= {"standings": limits_report.standings(run), "fewest": 5}
+    shown |= {"standings": limits_report.standings(run), "fewest": 5, "ranges": limits_report.ranges(run)}
     rendered = environment.from_string(section).render(shown)
     assert "10.0 [9.0, 11.0]" in rendered
     assert "figures/limits_budget_case_2.svg" in rendered

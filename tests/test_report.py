@@ -305,12 +305,12 @@ def test_claims_trials_and_budget_appear_where_they_were_run(several):
     assert not {"claims", "trials"} & report.tabulate(before).keys()
     for seed, case in product(range(6), CASES):
         folder = several / f"smoke/seed_{seed}/case_{case}"
-        made = origin("08_claims", case, seed)
+        made = origin("08_claims", case, seed) | {"revision": "abc", "seconds": 1.0}
         save_stage(folder / "experiments", made, {"scores.csv": pd.DataFrame({"stage": ["x"], "metric": ["y"], "value": [1.0]})})
         budget = pd.DataFrame({"episodes_per_epoch": [20, 500], "objective": [9.0 + seed, 12.0 + seed]})
         save_stage(folder / "online_budget", made, {"scores.csv": budget})
         scores = pd.DataFrame({"stage": ["offline"], "metric": ["feature_gap"], "value": [0.1 + seed / 100]})
-        made = origin("04_knowledge_transfer" if case == 3 else "02_offline_irl", case, seed, trial)
+        made |= origin("04_knowledge_transfer" if case == 3 else "02_offline_irl", case, seed, trial)
         save_stage(folder / f"{'transfer' if case == 3 else 'offline'}_{trial}", made, {"scores.csv": scores})
     results = collect(several, PARAMS, 6)
     drawn = report.draw(results)
@@ -372,6 +372,23 @@ def test_a_mixture_is_refused_naming_the_result_and_what_changed(own, entry, say
     sentence = refusal(own)
     assert f"{path} (changed: {says})" in sentence
     assert sentence.count("record.json") == 1
+
+
+def test_limits_of_other_inputs_are_refused_and_a_part_alone_is_none(own):
+    folder = own / "smoke/seed_0/case_1"
+    for part in collection.LIMITS[:-1]:
+        shutil.copytree(folder / "online_improved", folder / f"limits_{part}")
+    assert collect(own).limits == {}
+    shutil.copytree(folder / "online_improved", folder / "limits_safety")
+    results = collect(own)
+    assert set(results.limits) == {(1, 0, part) for part in collection.LIMITS}
+    records = [stage.record["seconds"] for stage in (*results.stages.values(), *results.limits.values())]
+    assert report.provenance(results)["stage_seconds"] == pytest.approx(sum(records))
+    path = folder / "limits_budget/record.json"
+    record = json.loads(path.read_text())
+    record["inputs"]["params/learning.yaml"] = 7
+    path.write_text(json.dumps(record))
+    assert f"{path} (changed: params/learning.yaml)" in refusal(own)
 
 
 def test_seeds_with_missing_stages_are_left_out_only_when_asked_and_the_report_says_so(several, tmp_path):

@@ -126,6 +126,32 @@ def test_the_sampling_error_that_ours_lack_is_added_to_features_only():
     assert fewer.loc[3, ["pred_low", "pred_high"]].tolist() == [-2.0, -2.0]  # never less than the runs' own
 
 
+def test_another_sampling_error_may_change_a_verdict():
+    """The policy's h-III is printed 0.5 below ours: beyond 1.96 x 0.13 (its own error), within 1.96 x 0.3 (that of the fit)."""
+    names = ["h-I", "h-III"]
+    printed = {4: PublishedCase(table=9, expert=(10.0, -2.0), policy=(11.0, -2.5), alpha=(0.6, -0.8))}
+    runs = seeds()
+    runs["metric"] = runs["metric"].str.replace("h-II", "h-III")
+    prediction = pd.DataFrame(
+        {"table": [9, 9, 8], "feature": ["h-III", "h-I", "h-III"], "published": -2.0, "simulated": -1.7, "deviation": 1.0}
+    )
+    errors = scorecard.sampling_errors(prediction, printed)
+    assert errors == {(4, "h-III"): pytest.approx(0.3)}
+    ours, wider = (scorecard.comparison(printed, runs, scorecard.summary(runs), names, MEASURED, found) for found in (None, errors))
+    found = scorecard.changed(ours, wider)
+    assert found[["row", "feature", "verdict", "verdict_with_the_wider_error"]].to_numpy().tolist() == [
+        ["policy", "h-III", "differs", "match"]
+    ]
+    assert scorecard.outside(ours) == {"match": 0, "differs": 2, "cannot tell": 0, "fitted": 0}
+
+
+def test_a_number_that_is_nan_in_every_seed_is_one_that_no_seed_gave():
+    runs = seeds()
+    runs.loc[runs["metric"] == "alpha:h-II", "value"] = np.nan
+    row = compare(runs).iloc[5]
+    assert (row["n_seeds"], row["verdict"], row["reason"]) == (0, "cannot tell", "no seed gave it")
+
+
 def test_comparison_has_a_row_for_each_published_number_even_if_nobody_reproduced_it():
     published = {case: load_published(PARAMS)[case] for case in (1, 2, 3)}
     table = compare(seeds().query("case == 1"), published, FEATURES)
@@ -210,6 +236,16 @@ def test_settings_fitted_to_one_table_predict_the_other():
     assert first["mean_error, %"] == pytest.approx(2.0)
     assert first["greatest_error, %"] == pytest.approx(3.0)
     assert first["greatest_deviation"] == 3.0
+
+
+def test_trials_are_compared_with_the_headline_on_their_seeds():
+    """Seeds differ more than the trials do; of four seeds nothing is said."""
+    rows = [("improved", case, seed, 0.1 * (seed + 1)) for case in (1, 2) for seed in range(9)]
+    rows += [("x", 1, seed, 0.1 * (seed + 1) - 0.01) for seed in range(5)]
+    rows += [("x", 2, seed, 0.1 * (seed + 1) + 0.01) for seed in range(5)]
+    rows += [("y", 1, seed, 0.0) for seed in range(4)]
+    trials = pd.DataFrame(rows, columns=["trial", "case", "seed", "gap"])
+    assert scorecard.against_headline(trials) == {"x": "better in I; worse in II", "y": "–"}
 
 
 def test_claims_are_put_together_over_cases_and_quantities():

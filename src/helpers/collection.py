@@ -18,6 +18,7 @@ DEMONSTRATIONS, ONLINE, BUDGET, EXPERIMENTS = "demonstrations", "online_improved
 OFFLINE = {"offline": "improved", "offline_printed": "printed"}  # stage in seeds.csv and the variant behind it
 REPORT = "05_report"
 INFERRED = "inferred_settings"  # which has no case, and stands with the first seed
+LIMITS = ("attainable", "budget", "quality", "robustness", "safety")  # the parts of notebook 06, the last one written last
 SCRATCH = "offline_improved"  # of a case that starts from another: the same learning without the transfer
 MADE_BY = {"demonstrations": "01", "offline": "02", "online": "03 (04 for the transfer case)", "transfer": "04"}
 
@@ -36,6 +37,8 @@ class Results:
         missing: of the seeds asked for, those of which a stage is missing, where that is allowed.
         claims: columns `claims.COLUMNS`; budget: seed, case, episodes_per_epoch, objective; trials: trial, family,
             description, case, seed, gap. Each is empty where it was not run. inferred: what notebook 00 wrote, if it was run.
+        limits: by case, seed and part of notebook 06, where it was run to its end.
+        beyond: every stage beyond the paper's own runs, those of claims, budget, trials, limits and inferred settings.
     """
 
     scale: str
@@ -47,6 +50,8 @@ class Results:
     budget: pd.DataFrame
     trials: pd.DataFrame
     inferred: Stage | None = None
+    limits: Mapping[tuple[int, int, str], Stage] = field(default_factory=dict)
+    beyond: tuple[Stage, ...] = ()
     made_from: Mapping[str, str] = field(default_factory=dict)
     missing: tuple[int, ...] = ()
 
@@ -87,7 +92,7 @@ def _offline_folder(params: Params, variant: str) -> str:
 def collect(
     root: Path, params_root: Path, scale: str, cases: tuple[int, ...], n_seeds: int, missing_allowed: bool = False
 ) -> Results:
-    """Read every stage of every case and seed below `root`; claims, budget and trials where they were run.
+    """Read every stage of every case and seed below `root`; claims, budget, trials and limits where they were run.
 
     Args:
         missing_allowed: leave out a seed of which a stage is missing, as long as another seed is whole.
@@ -127,8 +132,10 @@ def collect(
     }
     path = root / scale / "seed_0" / INFERRED
     inferred = load_stage(path, "notebook 00") if (path / RECORD).is_file() else None
-    optional = [*experiments.values(), *budget.values(), *(stage for found in trials.values() for stage in found.values())]
-    check([*stages.values(), *optional, *([inferred] if inferred else [])], root / scale, params_root)
+    limits = _limits(root / scale, cases, seeds_found)
+    tried = (stage for found in trials.values() for stage in found.values())
+    beyond = (*experiments.values(), *budget.values(), *tried, *limits.values(), *([inferred] if inferred else []))
+    check([*stages.values(), *beyond], root / scale, params_root)
     return Results(
         scale=scale,
         params=params,
@@ -139,6 +146,8 @@ def collect(
         budget=_budget(budget),
         trials=_trials(params, seeds, trials),
         inferred=inferred,
+        limits=limits,
+        beyond=beyond,
         made_from=inputs(REPORT, params_root, scale),
         missing=tuple(seed for seed in range(n_seeds) if seed not in seeds_found),
     )
@@ -158,6 +167,15 @@ def _finished(root: Path, cases: tuple[int, ...], seeds: Sequence[int], folder: 
     """An optional stage by case and seed, where it was run."""
     paths = {(case, seed): root / f"seed_{seed}" / f"case_{case}" / folder for case in cases for seed in seeds}
     return {key: load_stage(path, made_by) for key, path in paths.items() if (path / RECORD).is_file()}
+
+
+def _limits(root: Path, cases: tuple[int, ...], seeds: Sequence[int]) -> dict[tuple[int, int, str], Stage]:
+    """The parts of notebook 06 by case, seed and part, where it was run to its end."""
+    found = {}
+    for case, seed in _finished(root, cases, seeds, f"limits_{LIMITS[-1]}", "notebook 06"):
+        folder = root / f"seed_{seed}" / f"case_{case}"
+        found |= {(case, seed, part): load_stage(folder / f"limits_{part}", "notebook 06") for part in LIMITS}
+    return found
 
 
 def _claims(root: Path, params_root: Path, scale: str, seeds: Sequence[int]) -> pd.DataFrame:

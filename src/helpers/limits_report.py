@@ -6,8 +6,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from helpers import scorecard
-from helpers.artifacts import RECORD, load_stage
-from helpers.collection import DEMONSTRATIONS, Results
+from helpers.collection import Results
 from helpers.limits_answer import NO_LEARNERS, WITH_MODEL, answer
 from helpers.limits_figures import LABELS, budget_curves, gap_figure, heat_maps
 from helpers.statistics import FEWEST, median_interval
@@ -41,12 +40,8 @@ RUNS = {"hot": "hot start", "scratch": "from scratch"}
 
 def read(results: Results, part: str, name: str) -> pd.DataFrame:
     """One table of one part of notebook 06 for all cases and seeds, with columns case and seed; empty where none was run."""
-    frames = []
-    for (case, seed, folder), stage in results.stages.items():
-        path = stage.folder.parent / f"limits_{part}"
-        if folder == DEMONSTRATIONS and (path / RECORD).is_file():
-            table = load_stage(path, f"notebook 06 for case {case} and seed {seed}").table(name)
-            frames.append(table.assign(case=case, seed=seed))
+    stages = {(case, seed): stage for (case, seed, of_part), stage in results.limits.items() if of_part == part}
+    frames = [stage.table(name).assign(case=case, seed=seed) for (case, seed), stage in stages.items()]
     return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
 
 
@@ -85,6 +80,26 @@ def _worst(results: Results) -> pd.DataFrame:
     paired = robust.merge(expert, on=["case", "seed", "group", "row", "column"], suffixes=("", "_expert"))
     shares = paired.assign(value=100 * paired["objective"] / paired["objective_expert"])
     return shares.groupby(["case", "seed", "controller", "group"], as_index=False)["value"].min()
+
+
+def ranges(results: Results) -> str:
+    """What the grids of conditions span, in words; empty where notebook 06 was not run."""
+    robust = read(results, "robustness", "robustness.csv")
+    if robust.empty:
+        return ""
+    words = {
+        "model": "A and B times {} and {}",
+        "noise": "disturbance times {} and observation noise times {}",
+        "set_point": "the set points of the two loops times {} and {}",
+        "time": "dead time of {} samples and a load step of {} of the set point change per sample",
+    }
+    spans = robust.astype({"row": float, "column": float}).groupby("group")[["row", "column"]].agg(["min", "max"])
+    found = []
+    for group, text in words.items():
+        if group in spans.index:
+            ends = spans.loc[group]
+            found.append(text.format(*(f"{ends[axis, 'min']:g} to {ends[axis, 'max']:g}" for axis in ("row", "column"))))
+    return "; ".join(found)
 
 
 def price(results: Results) -> dict[int, dict[str, float]]:

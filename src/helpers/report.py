@@ -23,11 +23,15 @@ from helpers.artifacts import ArtifactError, code_revision
 from helpers.collection import ONLINE, Results
 from helpers.identity import digest, versions
 from helpers.params import OnlineParams
+from helpers.readings import MAIN
+from helpers.scratch import beside, sweep
 from helpers.session import parameters_hash
 from helpers.sources import PROJECT
 
 RUNNERS = ("papermill", "snakemake", "pypandoc_binary")  # packages that shape no number
 COLOURS = 128  # of a PNG: a third of the size, and no difference that the eye sees
+PROVENANCE = "provenance.json"
+OWN_ERROR = "as in the parameter files, with each trajectory's own |e| before the first step"  # what notebook 00 calls its main one
 TEMPLATE = PROJECT / "reports/template"
 BENCHMARKS = PROJECT / "reports/reference/benchmarks"  # of make bench, a run of its own
 OF_THE_PAPER = {"control_case_1": 3, "tracking_case_2": 4, "control_case_2": 5, "control_case_3": 6}  # numbers of its figures
@@ -113,17 +117,23 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     if len(results.claims):
         tabulated["claims"] = results.claims
     if len(results.trials):
-        tabulated["trials"] = tables.trials_table(results.trials)
+        trials = tables.trials_table(results.trials)
+        words = scorecard.against_headline(results.trials)
+        tabulated["trials"] = trials.assign(against_improved=trials["trial"].map(words).fillna(tables.NOT_KNOWN))
     if results.inferred is not None:
         for name in ("settings", "hypotheses", "prediction"):
             tabulated[f"inferred_{name}"] = results.inferred.table(f"{name}.csv")
         tabulated["inferred_errors"] = scorecard.held_out(tabulated["inferred_prediction"])
+        tabulated["inferred_hypotheses"] = tabulated["inferred_hypotheses"].replace({"reading": {MAIN.name: OWN_ERROR}})
+        errors = scorecard.sampling_errors(tabulated["inferred_prediction"], results.published)
+        wider = scorecard.comparison(results.published, results.seeds, medians, names, trajectories, errors)
+        tabulated["comparison_initial_error"] = scorecard.changed(compared, wider)
     return tabulated | limits_report.tabulate(results)
 
 
 def provenance(results: Results) -> dict[str, Any]:
     """Where the report comes from: code, versions, seeds, parameters and time; `identity` is that of all its stages."""
-    records = [stage.record for stage in results.stages.values()]
+    records = [stage.record for stage in (*results.stages.values(), *results.beyond)]
     return {
         "scale": results.scale,
         "seeds": sorted({seed for _, seed, _ in results.stages}),
@@ -147,9 +157,11 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
     Args:
         tabulated: what `tabulate` gave for these results, if it was asked before.
     """
-    partial = folder / f".partial.{os.getpid()}"
-    shutil.rmtree(partial, ignore_errors=True)
+    page = folder / "report.html"
+    partial = beside(folder / "report")
     try:
+        sweep(folder / "report")
+        shutil.rmtree(partial, ignore_errors=True)
         for name in ("figures", "tables"):
             (partial / name).mkdir(parents=True)
         drawn, origin = draw(results), provenance(results)
@@ -168,7 +180,7 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
             (partial / "tables" / f"{name}.md").write_text(tables.to_markdown(frame) + "\n", encoding="utf-8")
         tabulated["comparison"].to_csv(partial / "comparison.csv", index=False, float_format="%.10g")
         results.seeds.to_csv(partial / "seeds.csv", index=False, float_format="%.10g")
-        (partial / "provenance.json").write_text(json.dumps(origin, indent=1) + "\n", encoding="utf-8")
+        (partial / PROVENANCE).write_text(json.dumps(origin, indent=1) + "\n", encoding="utf-8")
         if results.inferred is not None:
             for ending in ("svg", "png"):
                 shutil.copy2(results.inferred.path(f"profiles.{ending}"), partial / f"figures/inferred_profiles.{ending}")
@@ -177,16 +189,16 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
         text = render(results, tabulated, origin)
         (partial / "report.md").write_text(text, encoding="utf-8")
         typeset(text, partial)
-        for path in partial.iterdir():
+        for path in sorted(partial.iterdir(), key=lambda path: path.name == PROVENANCE):  # last: it vouches for the others
             target = folder / path.name
             if target.is_dir():
                 shutil.rmtree(target)
             path.replace(target)
     except OSError as error:
-        raise ArtifactError(f"{folder}: the report could not be written: {error.strerror}") from error
+        raise ArtifactError(f"{folder}: the report could not be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return folder / "report.html"
+    return page
 
 
 def shortened(drawing: str) -> str:
@@ -207,8 +219,8 @@ def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapp
         """A median with its interval."""
         return tables.spread(factor * numbers.reindex([(case, stage, metric)]).iloc[0], **style)
 
-    parts = ("summary", "machine")
-    benchmarks = {part: (BENCHMARKS / f"{part}.md").read_text(encoding="utf-8") for part in parts if BENCHMARKS.is_dir()}
+    parts = {part: BENCHMARKS / f"{part}.md" for part in ("summary", "machine")}
+    benchmarks = {part: path.read_text(encoding="utf-8") for part, path in parts.items() if all(map(Path.is_file, parts.values()))}
     return environment.get_template("report.md.jinja").render(
         results=results,
         tables=tabulated,
@@ -225,6 +237,9 @@ def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapp
         listing=partial(scorecard.listing, tabulated["comparison"]),
         better=_better(results),
         nearer=scorecard.nearer_to_expert(tabulated["comparison"]),
+        outside=scorecard.outside(tabulated["comparison"]),
+        price=limits_report.price(results),
+        ranges=limits_report.ranges(results),
         settings=partial(_settings, tabulated["parameters"]),
         level=statistics.LEVEL,
         fewest=statistics.FEWEST,
@@ -242,12 +257,17 @@ def _settings(parameters: pd.DataFrame, status: str, part: int) -> str:
 
 
 def _better(results: Results) -> dict[str, list[int]]:
-    """The cases in which ours is better beyond its interval: the gap below the paper's, online J above the PID's."""
+    """The cases in which ours is better beyond its interval: the gap below the paper's, online J above the PID's.
+
+    worse_as_printed: those in which the gap of the algorithms as printed lies above the paper's.
+    """
     numbers = results.medians.set_index(scorecard.KEYS)
     low, high = (numbers[end].fillna(numbers["median"]) for end in ("ci_low", "ci_high"))
-    gap = [case for case, paper in results.published.items() if high[case, "offline", "feature_gap"] < paper.feature_gap]
+    papers = {case: record.feature_gap for case, record in results.published.items()}
+    gap = [case for case in papers if high[case, "offline", "feature_gap"] < papers[case]]
+    worse = [case for case in papers if low[case, "offline_printed", "feature_gap"] > papers[case]]
     online = [case for case in results.params if low[case, "online", "objective_x"] > high[case, "expert_paired", "objective_x"]]
-    return {"gap": gap, "online": online}
+    return {"gap": gap, "worse_as_printed": worse, "online": online}
 
 
 def typeset(text: str, folder: Path) -> None:

@@ -7,12 +7,13 @@ import pandas as pd
 
 from helpers.params import PublishedCase
 from helpers.statistics import median_interval, prediction_interval
-from helpers.tables import RESULT_DECIMALS, ROMAN, feature_symbol
+from helpers.tables import NOT_KNOWN, RESULT_DECIMALS, ROMAN, feature_symbol
 
 REPRODUCED_BY = {"expert": ("expert", "v"), "policy": ("offline", "v"), "alpha": ("offline", "alpha")}  # stage, metric
 MINIMUM_VARIANCE = "minimum_variance"  # the stage of the controller to measure online learning by
 FITTED = "expert"  # this row's settings were inferred from the very numbers that it is compared with
 ROWS = {"expert": "features of the expert", "policy": "features of the policy", "alpha": "weights"}
+HEADLINE = "improved"  # the variant that trials are compared with
 VERDICTS = ("match", "differs", "cannot tell", "fitted")
 WIDEST = 0.25  # half the width of a prediction interval that can still tell, as a share of the published value
 PUBLISHED_TRAJECTORIES = 500  # behind a published feature, Section 5.1.1
@@ -119,6 +120,7 @@ def comparison(
     medians: pd.DataFrame,
     feature_names: Sequence[str],
     trajectories: Mapping[str, int],
+    sampling_errors: Mapping[tuple[int, str], float] | None = None,
 ) -> pd.DataFrame:
     """One row for each published number of Tables 2-4, beside the median of ours over the seeds.
 
@@ -130,6 +132,7 @@ def comparison(
     Args:
         seeds: columns case, seed, stage, metric, value; `medians`: their `summary`.
         trajectories: K of each row that holds features.
+        sampling_errors: s/sqrt(500) by case and feature, where another than that of our own trajectories is to be taken.
     """
     found = medians.set_index(KEYS)
     runs = {key: group.dropna().to_numpy() for key, group in seeds.groupby(KEYS)["value"]}
@@ -144,13 +147,43 @@ def comparison(
                 lacking = 0.0
                 if metric == "v":
                     share = max(0.0, 1 / PUBLISHED_TRAJECTORIES - 1 / trajectories[row])
-                    lacking = float(np.mean(runs[case, stage, f"v:{feature}:std"] ** 2)) * share
+                    variance = float(np.mean(runs[case, stage, f"v:{feature}:std"] ** 2))
+                    if (case, feature) in (sampling_errors or {}):
+                        variance = PUBLISHED_TRAJECTORIES * sampling_errors[case, feature] ** 2
+                    lacking = variance * share
                 low, high = prediction_interval(runs[key], lacking)
                 ours = found.loc[key]
                 n_seeds = int(ours["n_seeds"])
                 numbers = [ours["median"], n_seeds, ours["ci_low"], ours["ci_high"], low, high]
                 rows.append([printed.table, case, row, feature, value, *numbers, *verdict(row, value, n_seeds, low, high)])
     return pd.DataFrame(rows, columns=COLUMNS)
+
+
+def sampling_errors(prediction: pd.DataFrame, published: Mapping[int, PublishedCase]) -> dict[tuple[int, str], float]:
+    """The standard error of a published Type III feature, by case and feature, as the fit of the settings has it.
+
+    There |e| before the first step is each trajectory's own, here its mean, one: the same expectation, but a wider scatter.
+
+    Args:
+        prediction: columns table, feature, published, simulated, deviation (in these standard errors) of the expert's features.
+    """
+    case_of = {record.table: case for case, record in published.items()}
+    rows = prediction[prediction["feature"].str.endswith("-III") & prediction["table"].isin(case_of)]
+    errors = ((rows["simulated"] - rows["published"]) / rows["deviation"]).abs()
+    return errors.groupby([rows["table"].map(case_of), rows["feature"]]).median().to_dict()
+
+
+def changed(compared: pd.DataFrame, other: pd.DataFrame) -> pd.DataFrame:
+    """The published numbers whose verdict another sampling error changes, with both verdicts."""
+    both = compared.assign(verdict_with_the_wider_error=other["verdict"])
+    columns = ["table", "row", "feature", "published", "reproduced", "verdict", "verdict_with_the_wider_error"]
+    return both.loc[compared["verdict"] != other["verdict"], columns].reset_index(drop=True)
+
+
+def outside(compared: pd.DataFrame) -> dict[str, int]:
+    """How many published numbers of each verdict lie outside the prediction interval of one run."""
+    beyond = (compared["published"] < compared["pred_low"]) | (compared["published"] > compared["pred_high"])
+    return beyond.groupby(compared["verdict"]).sum().reindex(VERDICTS, fill_value=0).to_dict()
 
 
 def counts(compared: pd.DataFrame) -> pd.DataFrame:
@@ -204,6 +237,24 @@ def held_out(prediction: pd.DataFrame) -> pd.DataFrame:
             }
         )
     return pd.DataFrame(rows)
+
+
+def against_headline(trials: pd.DataFrame) -> dict[str, str]:
+    """By trial, the cases in which it is better or worse than the variant `improved`, paired by seed, by the whole interval.
+
+    Args:
+        trials: columns trial, case, seed, gap (a share of one); the variants are among the trials.
+    """
+    gaps = trials.pivot_table(index=["case", "seed"], columns="trial", values="gap")
+    found = {}
+    for name in gaps.drop(columns=HEADLINE):
+        cases: dict[str, list[str]] = {"better": [], "worse": []}
+        for case, differences in (gaps[name] - gaps[HEADLINE]).dropna().groupby("case"):
+            low, high = median_interval(differences.to_numpy())
+            if word := "better" if high < 0 else "worse" if low > 0 else "":
+                cases[word].append(ROMAN[case - 1])
+        found[name] = "; ".join(f"{word} in {', '.join(numerals)}" for word, numerals in cases.items() if numerals) or NOT_KNOWN
+    return found
 
 
 def verdicts_of_claims(claims: pd.DataFrame) -> dict[str, list[str]]:

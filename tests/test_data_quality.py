@@ -56,6 +56,20 @@ def test_parquet_and_stamps_read_like_csv_and_numbers(clean, plant):
         pd.testing.assert_frame_equal(clean(table, data=name).table, expected)
 
 
+@pytest.mark.parametrize("zone", ["Z", "+01:00"])
+def test_stamps_with_a_zone_read_like_those_without(clean, plant, zone):
+    stamps = pd.Timestamp("2026-01-05") + pd.to_timedelta(plant.table["TIME"], unit="s")
+    zoned = plant.table.assign(TIME=stamps.dt.strftime("%Y-%m-%dT%H:%M:%S") + zone)
+    pd.testing.assert_frame_equal(clean(zoned).table, clean(plant.table).table)
+
+
+def test_where_the_clocks_change_no_time_is_lost(clean, plant):
+    stamps = pd.Timestamp("2026-10-25", tz="UTC") + pd.to_timedelta(plant.table["TIME"] + 3500, unit="s")
+    local = plant.table.assign(TIME=stamps.dt.tz_convert("Europe/Berlin"))
+    for name in ("plant.csv", "plant.parquet"):
+        pd.testing.assert_frame_equal(clean(local, data=name).table, clean(plant.table).table)
+
+
 def test_words_in_the_place_of_numbers_are_filled_on_a_line(clean, plant):
     table = plant.table.astype(object)
     table.loc[[50, 51], "Y0.PV"] = "I/O Timeout"
@@ -96,6 +110,7 @@ def test_a_frozen_sensor_and_a_spike_are_found(clean, plant):
     table.loc[310, "Y0.PV"] += 20
     after = clean(table)
     assert found(after, "frozen sensor").count == 30
+    assert found(after, "frozen sensor").rule == "10 or more equal values: all but the first missing"
     assert found(after, "outlier", "Y0.PV").rows == (312,)
     assert after.table["Y0.PV"][310] == pytest.approx(plant.table["Y0.PV"][[309, 311]].mean())
     assert after.table["segment"][[200, 201, 230, 231]].tolist() == [0, -1, -1, 1]
@@ -115,6 +130,13 @@ def test_inputs_at_bounds_and_manual_rows_are_counted_and_kept(clean, plant):
 
 def test_a_new_episode_ends_a_stretch(clean, plant):
     after = clean(plant.table.assign(RUN=np.where(plant.table.index < 77, "a", "b")), episode="RUN")
+    assert after.table["segment"].diff().fillna(0).ne(0).to_numpy().nonzero()[0].tolist() == [77]
+
+
+def test_a_row_out_of_order_does_not_cut_its_episode_into_pieces(clean, plant):
+    table = plant.table.assign(RUN=np.where(plant.table.index < 77, "a", "b"))
+    table.iloc[[75, 80]] = table.iloc[[80, 75]].to_numpy()
+    after = clean(table, episode="RUN")
     assert after.table["segment"].diff().fillna(0).ne(0).to_numpy().nonzero()[0].tolist() == [77]
 
 

@@ -74,3 +74,10 @@ def test_the_file_tells_about_itself_and_another_file_is_refused(deployed, tmp_p
     (tmp_path / "wrong.onnx").write_bytes(b"not a policy")
     with pytest.raises(InputError, match=r"wrong\.onnx: not a policy that can be run"):
         DeployedPolicy(tmp_path / "wrong.onnx")
+
+
+def test_a_file_that_gives_no_number_does_not_agree(deployed):
+    policy, file, task, steady = deployed
+    y, u = recorded(task)
+    y[3] = torch.nan
+    assert not disagreement(policy, file, task, y, u, *steady) <= 1e-5

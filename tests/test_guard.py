@@ -25,6 +25,17 @@ class Asking:
         return self.asked[None]
 
 
+class Remembering:
+    """A policy whose memory takes in all that it is shown, as the hidden states of a network do."""
+
+    def reset(self):
+        self.memory = np.zeros(2)
+
+    def step(self, y, set_point, u_previous):
+        self.memory = 0.8 * self.memory + (set_point - y)[0] + 0.01 * u_previous[0]
+        return 20.0 + 0.1 * self.memory[None]
+
+
 @pytest.fixture
 def description(tmp_path):
     return load_description(MadeUpPlant(2, 2, n_cycles=1).write(tmp_path))  # bounds 17..23 and 18..24, at rest 20 and 21
@@ -139,3 +150,84 @@ def test_two_loops_on_one_input_are_refused(description):
     twice = tuple(loop.model_copy(update={"manipulated": "u0"}) for loop in description.pid)
     with pytest.raises(InputError, match="two loops set the same manipulated variable"):
         Guard(Asking([20.0, 21.0]), description.model_copy(update={"pid": twice}), LIMITS)
+
+
+def test_a_set_point_that_is_no_number_is_bad_and_the_last_one_counts_on(description):
+    guard, measured = Guard(Remembering(), description, LIMITS), Measured()
+    for _ in range(30):
+        guard.step(measured(), SET_POINT)
+    memory, inputs, modes = guard.policy.memory.copy(), [], []
+    for _ in range(LIMITS.hold + 3):
+        inputs.append(guard.step(measured(), np.array([np.nan, 52.0])))
+        modes.append(guard.mode)
+    assert modes == [Mode.HOLD] * LIMITS.hold + [Mode.PID] * 3
+    assert guard.policy.memory.tolist() == memory.tolist()
+    assert inputs[-1][0] > inputs[0][0]  # its loop goes on towards the last set point, which lies above
+    inputs += [guard.step(measured(), SET_POINT) for _ in range(20)]
+    assert guard.mode == Mode.POLICY
+    assert np.isfinite(guard.policy.memory).all()
+    assert np.isfinite(inputs).all()
+    assert ((guard.low <= inputs) & (inputs <= guard.high)).all()
+
+
+def test_without_any_set_point_the_inputs_stay_held(description):
+    guard, measured = Guard(Remembering(), description, LIMITS), Measured()
+    inputs = [guard.step(measured(), np.full(2, np.nan)) for _ in range(LIMITS.hold + 5)]
+    assert guard.mode == Mode.PID
+    assert np.array(inputs) == pytest.approx(np.tile([20.0, 21.0], (len(inputs), 1)))
+
+
+@pytest.mark.parametrize("manual", [True, False], ids=["manual", "automatic"])
+def test_the_policy_s_memory_stands_still_on_a_number_out_of_range(description, manual):
+    guard, measured = Guard(Remembering(), description, LIMITS), Measured()
+    memories = []
+    for y in (measured(), measured((0, -9999.0))):
+        if manual:
+            guard.follow(y, SET_POINT, np.array([20.0, 21.0]))
+        else:
+            guard.step(y, SET_POINT)
+        memories.append(guard.policy.memory.tolist())
+    assert memories[1] == memories[0] != [0.0, 0.0]
+
+
+def test_an_operator_s_input_that_is_no_number_is_not_followed(description):
+    guard, measured = Guard(Remembering(), description, LIMITS), Measured()
+    guard.follow(measured(), SET_POINT, np.array([18.0, 19.0]))
+    guard.follow(measured(), SET_POINT, np.array([np.nan, 19.5]))
+    assert guard.u.tolist() == [18.0, 19.5]
+    assert guard.step(measured(), SET_POINT).tolist() == [18.0, 19.5]
+    assert np.isfinite(guard.policy.memory).all()
+
+
+def test_a_pid_that_fails_leaves_the_inputs_where_they_are(description):
+    broken = tuple(loop.model_copy(update={"proportional": np.nan}) for loop in description.pid)
+    guard, measured = in_automatic(description.model_copy(update={"pid": broken}))
+    before = guard.u.copy()
+    for _ in range(LIMITS.hold + 5):
+        guard.step(measured((0, np.nan)), SET_POINT)
+    assert guard.mode == Mode.PID
+    assert guard.u == pytest.approx(before)
+
+
+def test_a_sensor_that_comes_and_goes_reaches_the_pid(description):
+    guard, measured = in_automatic(description)
+    before, modes = guard.u.copy(), []
+    for sample in range(4 * LIMITS.hold):
+        guard.step(measured((0, np.nan)) if sample % 2 == 0 else measured(), SET_POINT)
+        modes.append(guard.mode)
+    assert modes == [Mode.HOLD] * 2 * LIMITS.hold + [Mode.PID] * 2 * LIMITS.hold
+    assert guard.u[1] > before[1] + 0.05  # the other loop works
+    for _ in range(LIMITS.healthy):
+        guard.step(measured(), SET_POINT)
+    assert guard.mode == Mode.POLICY
+    guard.step(measured((0, np.nan)), SET_POINT)
+    assert guard.mode == Mode.HOLD  # and the count begins anew
+
+
+def test_after_a_phase_in_manual_the_count_begins_anew(description):
+    guard, measured = in_automatic(description)
+    for _ in range(LIMITS.hold):
+        guard.step(measured((0, np.nan)), SET_POINT)
+    guard.follow(measured(), SET_POINT, guard.u)
+    guard.step(measured((0, np.nan)), SET_POINT)
+    assert guard.mode == Mode.HOLD

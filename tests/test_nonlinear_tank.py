@@ -82,5 +82,13 @@ def test_what_is_missing_ends_in_one_sentence(root, tmp_path):
     (tmp_path / "nonlinear_tank.yaml").write_text(text.replace("[0.005, 0.02]", "[0.005]"), encoding="utf-8")
     with pytest.raises(ParameterError, match="'sensor_noise': expected 2 entries, found 1"):
         load_tank(tmp_path, params)
+    for old, new, says in (
+        ("value: 3.0", "value: 0.06", "'concentration': 0.06 mol/L is too low for a 'temperature' of 350 K"),
+        ("{value: min", "{value: week", "'time_unit'"),
+    ):
+        assert old in text
+        (tmp_path / "nonlinear_tank.yaml").write_text(text.replace(old, new, 1), encoding="utf-8")
+        with pytest.raises(ParameterError, match=rf"nonlinear_tank\.yaml: key {says}"):
+            load_tank(tmp_path, params)
     with pytest.raises(ParameterError, match="'balance'"):
         load_tank(root, params.model_copy(update={"balance": None}))

@@ -12,8 +12,9 @@ from plants import HORIZON, MadeUpPlant
 
 from helpers import own_plant, plant_report
 from helpers.deployment import DeployedPolicy
-from helpers.params import ParameterError
+from helpers.params import InputError, ParameterError
 from helpers.plant_description import load_description
+from helpers.plant_model import LinearModel
 from helpers.sources import PROJECT
 
 
@@ -129,6 +130,57 @@ def test_what_cannot_be_used_is_one_sentence_and_a_status(tmp_path, quick_root, 
     path.write_text(path.read_text(encoding="utf-8").replace("time_unit: s", "time_unit: week"), encoding="utf-8")
     assert plant_report.main([str(path), "--scale", "smoke"]) == 2
     assert "key 'time_unit'" in capsys.readouterr().err
+
+
+def test_a_policy_that_does_not_agree_leaves_an_earlier_file_as_it_was(tmp_path, root, monkeypatch):
+    plant = small(own_plant.open_plant(MadeUpPlant(1, 1).write(tmp_path), root, "smoke", 0))
+    none = torch.zeros(1)
+    model = LinearModel(0.9 * torch.eye(1), 0.1 * torch.ones(1, 1), none, none, none, none, none).to(plant.dtype)
+    task = own_plant.task_at_rest(plant, model)
+    policy, path = plant.fresh_policy(task), tmp_path / "out/policy.onnx"
+    assert plant_report.export_policy(plant, policy, model, task, path) < 1e-5
+    before = path.read_bytes()
+    for worst in (0.5, np.nan):
+        monkeypatch.setattr(plant_report, "disagreement", lambda *_, worst=worst: worst)
+        with pytest.raises(InputError, match=r"out/policy\.onnx: the exported policy differs"):
+            plant_report.export_policy(plant, plant.fresh_policy(task), model, task, path)
+        assert path.read_bytes() == before
+        assert [file.name for file in path.parent.iterdir()] == ["policy.onnx"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "output", "status", "says"),
+    [
+        ({"plant": "gymnasium:NoSuch-v0"}, "out", 2, "plant 'gymnasium:NoSuch-v0': "),
+        ({"plant": "no_such_module:Plant"}, "out", 2, "plant 'no_such_module:Plant': "),
+        ({"transfer": {"y0": 60.0}}, "out", 2, "plant.csv: 0 episodes of 12 samples"),
+        ({}, "plant.yaml/out", 1, "plant.yaml/out: Not a directory"),
+        ({}, PROJECT / "src/helpers", 2, "parameter 'output': inside the project results go below results/ and reports/"),
+    ],
+)
+def test_what_cannot_end_well_is_refused_before_anything_is_learned(
+    changes, output, status, says, tmp_path, root, capsys, monkeypatch
+):
+    def too_late(*_):
+        raise AssertionError("the model is being identified")
+
+    monkeypatch.setattr(plant_report, "identify_plant", too_late)
+    path = MadeUpPlant(1, 1).write(tmp_path, **changes)
+    arguments = [str(path), "--scale", "smoke", "--params", str(root), "--output", str(tmp_path / output)]
+    assert plant_report.main(arguments) == status
+    sentence = capsys.readouterr().err
+    assert sentence.startswith("error: ")
+    assert says in sentence
+    assert sentence.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_report_that_cannot_be_written_is_one_sentence(tmp_path, quick_root, capsys):
+    (tmp_path / "out/report.md").mkdir(parents=True)
+    path = MadeUpPlant(1, 1).write(tmp_path)
+    arguments = [str(path), "--output", str(tmp_path / "out"), "--scale", "smoke", "--params", str(quick_root)]
+    assert plant_report.main(arguments) == 1
+    assert capsys.readouterr().err.splitlines()[-1] == f"error: {tmp_path / 'out/report.md'}: Is a directory"
 
 
 def blocks(language):

@@ -50,12 +50,18 @@ def test_the_committed_description_gives_the_task_of_case_study_one_with_its_own
         (changed("controlled", 1, "set_point", value=51.0), ["'controlled.1'", "give 'error_scale'"]),
         (changed("manipulated", 0, "rate", value=-1.0), ["'manipulated.0.rate'"]),
         (changed("manipulated", 1, "tag", value="U0.OP"), ["the tag 'U0.OP' occurs twice"]),
+        *(
+            (changed("controlled", 0, key, value=tag), [f"'controlled.0.{key}'", f"found '{tag}'"])
+            for key, tag in (("tag", "run"), ("tag", "segment"), ("set_point_tag", "clock"))
+        ),
+        (changed("manipulated", 1, "tag", value="row"), ["'manipulated.1.tag'", "other than the program's own columns"]),
         (changed("manipulated", 1, "name", value="y0"), ["the name 'y0' occurs twice"]),
         (changed("pid", 0, "manipulated", value="valve"), ["the manipulated variable 'valve', which is not described"]),
         (changed("controlled", value=[]), ["'controlled'"]),
         (changed("transfer", value={"u0": 51.0}), ["'transfer' names 'u0', which is no controlled variable"]),
         (changed("transfer", value={"y0": 1.0e9}), ["'transfer' takes 'y0' outside 'low' to 'high'"]),
         (changed("transfer", value={"y0": "far"}), ["'transfer.y0'"]),
+        (changed("transfer", value={"y0": 50.0}), ["'transfer' takes 'y0' to its 'steady_state'", "give 'error_scale'"]),
     ],
 )
 def test_what_cannot_be_is_refused(content, says, tmp_path):
@@ -66,3 +72,17 @@ def test_what_cannot_be_is_refused(content, says, tmp_path):
     assert sentence.startswith(str(path))
     assert "\n" not in sentence
     assert all(words in sentence for words in says), sentence
+
+
+def test_a_task_back_at_the_steady_state_needs_a_scale_of_the_error(tmp_path):
+    description = load_description(PLANT.write(tmp_path))
+    with pytest.raises(ParameterError, match=r"set point of 'y1': it equals 'steady_state', .* give 'error_scale'"):
+        description.with_set_points({"y1": 51.0})
+    scaled = changed("controlled", 1, "error_scale", value=0.5) | {"transfer": {"y1": 51.0}}
+    description = load_description(PLANT.write(tmp_path, **scaled))
+    assert description.with_set_points(description.transfer).controlled[1].scale == 0.5
+
+
+def test_columns_that_hold_no_numbers_may_be_called_as_they_like(tmp_path):
+    path = PLANT.write(tmp_path, time="clock", episode="run", mode="automatic")
+    assert load_description(path).columns[:3] == ("clock", "run", "automatic")

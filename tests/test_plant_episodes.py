@@ -70,6 +70,26 @@ def test_too_few_episodes_are_refused_with_the_reasons(cut):
         cut(plant, plant.table[(plant.table.index % HOLD < 5) | (plant.table.index % HOLD > 14)])
 
 
+def test_a_record_shorter_than_an_episode_is_refused_with_the_reasons(cut):
+    plant = MadeUpPlant(2, 2, CYCLES)
+    with pytest.raises(InputError, match=r"plant\.csv: 0 episodes of 100 samples .* left out: 1 cut short"):
+        cut(plant, plant.table.iloc[: 2 * HOLD], horizon=100)
+
+
+def test_after_a_break_the_input_before_is_the_first_of_the_episode(cut):
+    plant = MadeUpPlant(1, 1, CYCLES)
+    still = plant.content["controlled"][0] | {"set_point": float(plant.steady_y[0]), "error_scale": 0.5}
+    table = plant.table.assign(**{"Y0.SP": plant.steady_y[0]})
+    table.loc[100:129, "U0.OP"] = np.nan
+    _, _, found = cut(plant, table, controlled=[still])
+    assert found.before.isfinite().all()
+    inputs = table["U0.OP"].to_numpy() - plant.steady_u
+    episode = found.starts.index(130 + 2)
+    assert found.before[episode].item() == pytest.approx(inputs[130])
+    assert found.before[episode + 1].item() == pytest.approx(inputs[130 + HORIZON])
+    assert found.before[0].item() == pytest.approx(inputs[0])
+
+
 def test_stretches_hold_every_usable_row_in_deviation_variables(cut):
     plant = MadeUpPlant(2, 2, CYCLES)
     clean, description, _ = cut(plant, plant.table.drop(index=range(100, 110)))

@@ -90,6 +90,13 @@ def test_what_cannot_be_imported_is_refused(description):
             load_plant(name, description)
 
 
+@pytest.mark.parametrize("name", ["NoSuch-v0", "CartPole-v999", "no_such_module:Env-v0", ""])
+def test_an_environment_that_cannot_be_made_is_refused(description, name):
+    pytest.importorskip("gymnasium")
+    with pytest.raises(InputError, match=f"plant 'gymnasium:{name}': it cannot be made: "):
+        load_plant(f"gymnasium:{name}", description)
+
+
 def test_a_gymnasium_environment_runs_in_engineering_units(description):
     gymnasium = pytest.importorskip("gymnasium")
 

@@ -164,7 +164,7 @@ def _frozen(tag: str, values: Array, row: NDArray, params: QualityParams, found:
     """A sensor that repeats the very same value for long is frozen: all but the first become missing."""
     same = np.diff(values, prepend=np.nan) == 0
     frozen = _long_runs(same, params.frozen - 1)
-    found += finding("frozen sensor", tag, _rows(row, frozen), f"missing after {params.frozen} equal values")
+    found += finding("frozen sensor", tag, _rows(row, frozen), f"{params.frozen} or more equal values: all but the first missing")
     values[frozen] = np.nan
 
 

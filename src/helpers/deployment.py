@@ -138,6 +138,6 @@ def disagreement(
     worst = 0.0
     for t in range(len(u)):
         found = deployed.step(measured[t], set_point, u_previous)
-        worst = max(worst, float(np.abs((found - expected[t]) / span).max()))
+        worst = float(np.maximum(worst, np.abs((found - expected[t]) / span).max()))  # nan stays, which max() would drop
         u_previous = inputs[t]
     return worst

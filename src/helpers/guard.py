@@ -46,8 +46,10 @@ class Guard:
 
     In manual it follows what the operator does, so that the policy's memory is warm and the switch is bumpless: the first input is
     where the operator left it, and the difference to what the policy asks for fades. A measurement that is not a number, lies
-    outside its range or does not change is bad: the inputs are held, then the PID loops whose measurement is good take over
-    from where the inputs are, and the others stay held. The inputs never leave their bounds nor move faster than their rate.
+    outside its range or does not change is bad, and so is a set point that is no number; the last one that was a number counts on.
+    While anything is bad the policy's memory stands still and the inputs are held; then the PID loops whose measurement is good
+    take over from where the inputs are, and the others stay held. The inputs never leave their bounds nor move faster than their
+    rate.
     """
 
     policy: DeployedPolicy
@@ -69,31 +71,34 @@ class Guard:
         self.mode = Mode.MANUAL
         self.u = np.array([variable.steady_state for variable in manipulated])
         self.offset = np.zeros(len(manipulated))
+        self.set_point = np.full(len(controlled), np.nan)  # the last that was a number
         self.last = np.full(len(controlled), np.nan)
         self.repeats = np.zeros(len(controlled), dtype=int)
         self.n_bad = self.n_good = 0
         self.policy.reset()
 
     def follow(self, y: Array, set_point: Array, u: Array) -> None:
-        """A sample in manual: the operator has set `u`."""
+        """A sample in manual: the operator has set `u`; of an input that is no number the last one counts on."""
         self.mode = Mode.MANUAL
-        self._look(y)
-        self._ask(y, set_point)
-        self.u = np.asarray(u, dtype=float).copy()
+        self.n_bad = self.n_good = 0
+        self._ask(y, self._look(y) & self._aim(set_point))
+        self.u = np.where(np.isfinite(u), u, self.u).astype(float)
 
     def step(self, y: Array, set_point: Array) -> Array:
         """A sample in automatic: the inputs to apply, (n_u,)."""
         good = self._look(y)
-        wanted = self._ask(y, set_point)
-        healthy = bool(good.all() and np.isfinite(wanted).all())
-        self.n_bad, self.n_good = (0, self.n_good + 1) if healthy else (self.n_bad + 1, 0)
+        wanted = self._ask(y, good & self._aim(set_point))
+        healthy = bool(np.isfinite(wanted).all())
+        self.n_bad, self.n_good = (self.n_bad, self.n_good + 1) if healthy else (self.n_bad + 1, 0)
         before, self.mode = self.mode, self._next_mode(healthy)
         if self.mode == Mode.POLICY:
+            self.n_bad = 0  # not before: a sensor that comes and goes would have the inputs held for ever
             command, fresh = wanted, np.full(len(self.u), before != Mode.POLICY)
         elif self.mode == Mode.PID:
-            command, fresh = self._pid(y, set_point, good, begins=before != Mode.PID)
+            command, fresh = self._pid(y, good & np.isfinite(self.set_point), begins=before != Mode.PID)
         else:
             command, fresh = self.u, np.ones(len(self.u), dtype=bool)
+        command = np.where(np.isfinite(command), command, self.u)  # an input that is no number would never become one again
         # Whoever takes over begins where the inputs are; the difference to what it asks for fades.
         self.offset = np.where(fresh, self.u - command, self.offset * np.exp(-1 / self.limits.fade))
         command = command + self.offset
@@ -114,13 +119,19 @@ class Guard:
         inside = (y >= self.possible[0]) & (y <= self.possible[1])  # nan is not
         return inside & (self.repeats < self.limits.stale)
 
-    def _ask(self, y: Array, set_point: Array) -> Array:
-        """What the policy would do; its memory does not advance on a number that is none."""
-        if not np.isfinite(y).all():
-            return np.full(len(self.u), np.nan)
-        return self.policy.step(np.atleast_2d(y).astype(float), np.atleast_2d(set_point).astype(float), self.u[None])[0]
+    def _aim(self, set_point: Array) -> NDArray[np.bool_]:
+        """Which set points are numbers; of the others the last one counts on."""
+        given = np.isfinite(set_point)
+        self.set_point = np.where(given, set_point, self.set_point)
+        return given
 
-    def _pid(self, y: Array, set_point: Array, good: NDArray[np.bool_], begins: bool) -> tuple[Array, NDArray[np.bool_]]:
+    def _ask(self, y: Array, good: NDArray[np.bool_]) -> Array:
+        """What the policy would do, (n_u,), nan if anything is bad: its memory does not advance on that."""
+        if not good.all():
+            return np.full(len(self.u), np.nan)
+        return self.policy.step(np.atleast_2d(y).astype(float), self.set_point[None].astype(float), self.u[None])[0]
+
+    def _pid(self, y: Array, good: NDArray[np.bool_], begins: bool) -> tuple[Array, NDArray[np.bool_]]:
         """The fall-back: loops with a good measurement, every other input stays where it is; and which loops begin now."""
         if begins:
             self.running.clear()
@@ -134,8 +145,8 @@ class Guard:
                 limits = (self.low[index], self.high[index])
                 gains = (loop.proportional, loop.integral, loop.derivative)
                 pid = self.running[index] = PID(*gains, sample_time=None, output_limits=limits, auto_mode=False)
-                pid.set_auto_mode(True, last_output=self.u[index] - loop.proportional * (set_point[output] - y[output]))
+                pid.set_auto_mode(True, last_output=self.u[index] - loop.proportional * (self.set_point[output] - y[output]))
             pid = self.running[index]
-            pid.setpoint = set_point[output]
+            pid.setpoint = self.set_point[output]
             command[index] = pid(y[output], dt=self.description.sampling_time)
         return command, fresh

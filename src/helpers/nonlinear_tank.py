@@ -6,7 +6,7 @@ Its linearisation at the steady state is Eq. 4.1.3b; `process.linearised_balance
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import torch
@@ -24,7 +24,6 @@ from helpers.params import (
     ProcessParams,
     Record,
     Share,
-    Text,
     Vector,
     load,
     read_yaml,
@@ -60,7 +59,7 @@ class TankParams(Record):
 
     concentration: Annotated[Positive, Leaf("mol/L")]
     temperature: Annotated[Positive, Leaf("K")]
-    time_unit: Annotated[Text, Leaf("-")]
+    time_unit: Annotated[Literal["s", "min", "h"], Leaf("-")]
     tolerance: Annotated[Positive, Leaf("-")]
     sensor_noise: Annotated[tuple[NotNegative, ...], Leaf("mol/L, K")]
     history: HistoryParams
@@ -106,7 +105,7 @@ class NonlinearTank:
         self.steady = SteadyState.of(params.balance, tank)
         self.n_states = self.n_outputs = len(self.steady.controlled)
         self.n_inputs = len(self.steady.manipulated)
-        self.sampling_time = params.sampling_time
+        self.sampling_time, self.time_unit = params.sampling_time, tank.time_unit
         self.tolerance = tank.tolerance
         self.disturbance = torch.tensor(params.disturbance, dtype=torch.float64) * params.sampling_time**0.5
         self.relative_noise = torch.tensor(params.observation_noise, dtype=torch.float64)
@@ -151,7 +150,11 @@ class NonlinearTank:
 
 
 def load_tank(root: Path, process: ProcessParams) -> tuple[NonlinearTank, TankParams]:
-    """The tank of params/nonlinear_tank.yaml with the groups of the process."""
+    """The tank of params/nonlinear_tank.yaml with the groups of the process.
+
+    Raises:
+        ParameterError: in one sentence that names the file and the key.
+    """
     path = root / "nonlinear_tank.yaml"
     params = validate(TankParams, read_yaml(path), path)
     own = ("proportional", "integral", "input_low", "input_high", "other_set_point")
@@ -159,7 +162,13 @@ def load_tank(root: Path, process: ProcessParams) -> tuple[NonlinearTank, TankPa
     for name, value in vectors.items():
         if len(value) != len(process.controlled):
             raise ParameterError(f"{path}: key '{name}': expected {len(process.controlled)} entries, found {len(value)}")
-    return NonlinearTank(process, params, root / "process.yaml"), params
+    try:
+        return NonlinearTank(process, params, root / "process.yaml"), params
+    except OverflowError as error:
+        raise ParameterError(
+            f"{path}: key 'concentration': {params.concentration:g} mol/L is too low for a 'temperature' of "
+            f"{params.temperature:g} K: the frequency factor of the reaction exceeds every number"
+        ) from error
 
 
 def example(description: object = None) -> NonlinearTank:

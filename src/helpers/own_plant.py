@@ -4,7 +4,7 @@ The learning is that of the paper's plant; what differs is that a plant shows y 
 """
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -257,11 +257,11 @@ def parameter_table(plant: OwnPlant, identified: Identified) -> pd.DataFrame:
     return pd.concat({"value": values.T, "standard error": errors.T}, axis=1)
 
 
-def history(records: Sequence[Any], names: Sequence[str], report: Callable[[Any], dict[str, Any]] = vars) -> pd.DataFrame:
+def history(records: Sequence[Any], names: Sequence[str]) -> pd.DataFrame:
     """Records of learning as a table; the weights become one column a feature, `alpha:<feature>`."""
     rows = []
     for record in records:
-        row = dict(report(record))
+        row = dict(vars(record))
         weights = row.pop("weights", ())
         rows.append(row | {f"alpha:{name}": value for name, value in zip(names, weights, strict=False)})
     return pd.DataFrame(rows)

@@ -74,7 +74,7 @@ def read_records(path: Path, description: PlantDescription) -> Records:
     rows = np.arange(FIRST_ROW, FIRST_ROW + len(raw))
     found: list[Finding] = []
     columns: dict[str, np.ndarray] = {"row": rows.astype(np.int32), "clock": _clock(raw.pop(description.time), path, description)}
-    columns["run"] = _changes(raw.pop(description.episode)) if description.episode else np.zeros(len(raw), dtype=np.int32)
+    columns["run"] = pd.factorize(raw.pop(description.episode))[0] if description.episode else np.zeros(len(raw), dtype=np.int32)
     known = raw.pop(description.mode).astype(str).isin(description.automatic) if description.mode else None
     columns["automatic"] = np.ones(len(raw), dtype=bool) if known is None else known.to_numpy(dtype=bool)
     for tag in list(raw):
@@ -91,6 +91,7 @@ def read_records(path: Path, description: PlantDescription) -> Records:
     found += finding("out of order", description.time, rows[late], "sorted by time")
     if len(late):
         columns = {name: values[order] for name, values in columns.items()}
+    columns["run"] = _changes(columns["run"])  # in the order of time: one late row must not cut its run into pieces
     table = pd.DataFrame(columns, copy=False)
     return Records(path, _schema(description).validate(table), tuple(found))
 
@@ -120,8 +121,9 @@ def _read(path: Path, columns: tuple[str, ...]) -> pd.DataFrame:
 def _clock(time: pd.Series, path: Path, description: PlantDescription) -> np.ndarray:
     """Time in samples since the first row: stamps with a date, or numbers in the unit of the description."""
     if not pd.api.types.is_numeric_dtype(time):
-        stamps = time if pd.api.types.is_datetime64_any_dtype(time) else pd.to_datetime(time.astype(str), errors="coerce")
-        seconds = stamps.astype("datetime64[ns]").astype("int64") / 1e9
+        known = time if pd.api.types.is_datetime64_any_dtype(time) else time.astype(str)
+        stamps = pd.to_datetime(known, errors="coerce", utc=True)  # with or without a zone; a change of the clocks is no gap then
+        seconds = stamps.astype("datetime64[ns, UTC]").astype("int64") / 1e9
         numbers = seconds.where(stamps.notna()).to_numpy(dtype=float, na_value=np.nan) / SECONDS[description.time_unit]
     else:
         numbers = time.to_numpy(dtype=float, na_value=np.nan)
@@ -131,9 +133,8 @@ def _clock(time: pd.Series, path: Path, description: PlantDescription) -> np.nda
     return (numbers - numbers.min()) / description.sampling_time
 
 
-def _changes(episode: pd.Series) -> np.ndarray:
-    """A number that goes up by one wherever the episode changes."""
-    codes = pd.factorize(episode)[0]
+def _changes(codes: np.ndarray) -> np.ndarray:
+    """A number that goes up by one wherever the code of the episode changes."""
     return np.concatenate([[0], (np.diff(codes) != 0).cumsum()]).astype(np.int32)
 
 

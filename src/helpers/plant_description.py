@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import torch
-from pydantic import Field, Strict, model_validator
+from pydantic import AfterValidator, Field, Strict, model_validator
 from pydantic_core import PydanticCustomError
 from torch import Tensor
 
@@ -16,6 +16,17 @@ from helpers.params import Count, NotZero, ParameterError, Positive, Real, Recor
 from helpers.task import ControlTask
 
 SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
+RESERVED = ("row", "clock", "run", "automatic", "segment")  # columns that the table of a record has beside those of the tags
+
+
+def _free(tag: str) -> str:
+    if tag in RESERVED:
+        own = {"own": ", ".join(RESERVED)}
+        raise PydanticCustomError("reserved", "expected a tag other than the program's own columns ({own})", own)
+    return tag
+
+
+Tag = Annotated[Text, AfterValidator(_free)]
 
 
 class Variable(Record):
@@ -23,7 +34,7 @@ class Variable(Record):
 
     name: Text
     description: Annotated[str, Strict()] = ""
-    tag: Text
+    tag: Tag
     unit: Text
     low: Real
     high: Real
@@ -44,7 +55,7 @@ class ControlledVariable(Variable):
     `error_scale`, y_sp - y_ss otherwise, is needed where the set point does not move.
     """
 
-    set_point_tag: Text | None = None
+    set_point_tag: Tag | None = None
     set_point: Real
     error_scale: NotZero | None = None
 
@@ -122,6 +133,9 @@ class PlantDescription(Record):
                 raise PydanticCustomError("transfer", "'transfer' names '{name}', which is no controlled variable", {"name": name})
             if not aimed.low <= value <= aimed.high:
                 raise PydanticCustomError("transfer", "'transfer' takes '{name}' outside 'low' to 'high'", {"name": name})
+            if aimed.error_scale is None and value == aimed.steady_state:
+                still = "'transfer' takes '{name}' to its 'steady_state', so the error has no scale: give 'error_scale'"
+                raise PydanticCustomError("transfer", still, {"name": name})
         return self
 
     @property
@@ -157,7 +171,11 @@ class PlantDescription(Record):
         )
 
     def with_set_points(self, set_points: dict[str, float]) -> "PlantDescription":
-        """The same plant with other set points, by name of the controlled variable: the task of a transfer."""
+        """The same plant with other set points, by name of the controlled variable: the task of a transfer.
+
+        Raises:
+            ParameterError: if a name is unknown, or a set point is the steady state of a variable without 'error_scale'.
+        """
         unknown = sorted({*set_points} - {variable.name for variable in self.controlled})
         if unknown:
             known = ", ".join(variable.name for variable in self.controlled)
@@ -166,6 +184,9 @@ class PlantDescription(Record):
             variable.model_copy(update={"set_point": set_points.get(variable.name, variable.set_point)})
             for variable in self.controlled
         ]
+        still = next((variable.name for variable in moved if variable.scale == 0), None)
+        if still is not None:
+            raise ParameterError(f"set point of '{still}': it equals 'steady_state', so the error has no scale: give 'error_scale'")
         return self.model_copy(update={"controlled": tuple(moved)})
 
 

@@ -33,7 +33,7 @@ class Episodes:
 
     Attributes:
         trajectories: with y in the place of x, which a plant does not show; the command is the input.
-        before: the inputs one sample before each episode, shape (K, n_u).
+        before: the inputs one sample before each episode, shape (K, n_u); after a break those of its first sample.
         starts: the rows of the file where they begin.
         left_out: how many more began, by the reason why they do not count.
     """
@@ -84,8 +84,9 @@ def episodes(clean: CleanRecords, description: PlantDescription, params: Quality
     )
     fits = first <= last
     within = np.where(fits, first, 0)
-    whole, hands_off, held = totals[:, within + length] - totals[:, within] == length
-    whole &= fits & (segment[within] == segment[within + length - 1])
+    end = np.minimum(within + length, len(table))  # of a record shorter than an episode, which fits nowhere
+    whole, hands_off, held = totals[:, end] - totals[:, within] == length
+    whole &= fits & (segment[within] == segment[end - 1])
     left_out = {
         "cut short by a break": int((~whole).sum()),
         "not in automatic": int((whole & ~hands_off).sum()),
@@ -102,7 +103,9 @@ def episodes(clean: CleanRecords, description: PlantDescription, params: Quality
     index = starts[None, :] + np.arange(length)[:, None]
     outputs = torch.tensor(y[index], dtype=dtype)
     inputs = torch.tensor(u[index[:-1]], dtype=dtype)
-    before = torch.tensor(u[np.maximum(starts - 1, 0)], dtype=dtype)
+    previous = np.maximum(starts - 1, 0)
+    # Before a break the input is not known, or was another: the first of the episode stands for it.
+    before = torch.tensor(u[np.where(segment[previous] == segment[starts], previous, starts)], dtype=dtype)
     rows = tuple(int(row) for row in table["row"].to_numpy()[starts])
     return Episodes(Trajectories(outputs, outputs, inputs, inputs), before, rows, left_out)
 

@@ -142,12 +142,6 @@ def with_units(figure: Figure, description: PlantDescription) -> Figure:
     return figure
 
 
-def quality_counts(clean: CleanRecords) -> pd.DataFrame:
-    """How many rows each check found, a row a check and a column a column of the file."""
-    section = clean.section()
-    return section.pivot_table(index="check", columns="column", values="count", aggfunc="sum", sort=False).fillna(0).astype(int)
-
-
 def guard_figure(steps: pd.DataFrame, description: PlantDescription) -> Figure:
     """A guarded policy sample by sample, a panel for each variable; engineering units. The shade says who sets the inputs.
 

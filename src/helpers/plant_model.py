@@ -72,11 +72,14 @@ class GymnasiumPlant:
     def __init__(self, environment: str, description: PlantDescription) -> None:
         gymnasium = importlib.import_module("gymnasium")
         self.make = partial(gymnasium.make, environment)
+        try:
+            self.copies: list[Any] = [self.make()]
+        except (gymnasium.error.Error, ImportError, AttributeError, TypeError, ValueError) as error:
+            raise InputError(f"plant '{GYMNASIUM}{environment}': it cannot be made: {error}") from error
         self.steady_y = description.steady("controlled")
         self.steady_u = description.steady("manipulated")
         self.n_states = self.n_outputs = len(self.steady_y)
         self.n_inputs = len(self.steady_u)
-        self.copies: list[Any] = [self.make()]
         self._stepped = False
         spaces = {
             "observation": (self.copies[0].observation_space, self.n_outputs),

@@ -36,6 +36,8 @@ from helpers.plant_figures import quality_figure, response_figure, validation_fi
 from helpers.plant_model import load_plant
 from helpers.policy import LSTMPolicy
 from helpers.process import Process
+from helpers.request import check_place
+from helpers.scratch import beside, sweep
 from helpers.sources import PROJECT
 from helpers.task import ControlTask
 from helpers.trajectories import Trajectories
@@ -68,15 +70,21 @@ def export_policy(plant: OwnPlant, policy: LSTMPolicy, process: Process, task: C
     """Write the policy as ONNX and check it over whole episodes; the greatest disagreement, as a share of the input range.
 
     Raises:
-        InputError: if file and policy disagree.
+        InputError: if file and policy disagree; what was at `path` before stays.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    sweep(path)
+    partial = beside(path)
     steady = plant.description.steady("controlled"), plant.description.steady("manipulated")
-    export(policy, task, *steady, path, notes(plant))
     batch = compare(plant, process, task, {"policy": policy})["policy"]
-    worst = disagreement(policy, DeployedPolicy(path), task, batch.y, batch.u, *steady)
-    if worst > AGREEMENT:
-        raise InputError(f"{path}: the exported policy differs from the learned one by {worst:.1g} of the input range")
+    try:
+        export(policy, task, *steady, partial, notes(plant))
+        worst = disagreement(policy, DeployedPolicy(partial), task, batch.y, batch.u, *steady)
+        if not worst <= AGREEMENT:  # nan is not
+            raise InputError(f"{path}: the exported policy differs from the learned one by {worst:.1g} of the input range")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
     return worst
 
 
@@ -94,10 +102,21 @@ def beside_the_record(plant: OwnPlant, batch: Trajectories) -> Figure:
 
 
 def run(path: Path, output: Path, params_root: Path, scale: str, seed: int) -> Outcome:
-    """The whole chain for one description; writes into `output`."""
+    """The whole chain for one description; writes into `output`.
+
+    What the plant, the transfer or the folder may lack is found before anything is learned.
+
+    Raises:
+        InputError: in one sentence, if something that was given cannot be used. OSError: if `output` cannot be written.
+    """
     params = load(params_root, 1)
     torch.set_num_threads(params.learning.scales[scale].threads)
     plant = open_plant(path, params_root, scale, seed, params)
+    name = plant.description.plant
+    given = load_plant(name, plant.description) if name else None
+    if plant.description.transfer:
+        plant.with_set_points(plant.description.transfer)  # for its refusals alone
+    output.mkdir(parents=True, exist_ok=True)
     found = plant.demonstrations
     sentences = [
         f"{len(plant.clean.table)} samples, {len(plant.clean.findings)} findings, {found.trajectories.n_trajectories} episodes of "
@@ -109,8 +128,7 @@ def run(path: Path, output: Path, params_root: Path, scale: str, seed: int) -> O
     model = identified.model.to(plant.dtype)
     task = task_on(plant, model)
     offline = learn_offline(plant, model, task)
-    name = plant.description.plant
-    process: Process = load_plant(name, plant.description) if name else model
+    process: Process = model if given is None else given
     sentences.append(f"online learning ran on {name}" if name else "online learning ran on the identified model: no plant is named")
     plant_task = task_at_rest(plant, process) if name else task
     online, _ = improve_on(plant, copy.deepcopy(offline.policy), process, plant_task)
@@ -169,10 +187,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--params", type=Path, default=PROJECT / "params", help="the folder of parameter files")
     given = parser.parse_args(arguments)
     try:
+        check_place("output", given.output)
         outcome = run(given.description, given.output, given.params, given.scale, given.seed)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        print(f"error: {error.filename or given.output}: {error.strerror or error}", file=sys.stderr)
+        return 1
     print("\n".join(outcome.sentences))
     print(f"written: {given.output / 'report.md'}, its figures and policies beside it")
     return 0

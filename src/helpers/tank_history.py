@@ -99,7 +99,7 @@ def record(tank: NonlinearTank, params: HistoryParams, plan: Plan, generator: to
         x = tank.step(x, u, noise[t, 1], plan.drift[t].item())
     columns = [f"{loop}.{signal}" for signal in ("PV", "SP", "OP") for loop in LOOPS]
     table = pd.DataFrame(torch.stack(rows).numpy(), columns=columns).assign(MODE=modes)
-    seconds = pd.Timedelta(tank.sampling_time, "min")
+    seconds = pd.Timedelta(tank.sampling_time, tank.time_unit)
     return table.assign(TIME=START + np.arange(n_samples) * seconds)[["TIME", *columns, "MODE"]]
 
 

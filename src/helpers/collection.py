@@ -171,7 +171,7 @@ def _finished(root: Path, cases: tuple[int, ...], seeds: Sequence[int], folder: 
 
 def _limits(root: Path, cases: tuple[int, ...], seeds: Sequence[int]) -> dict[tuple[int, int, str], Stage]:
     """The parts of notebook 06 by case, seed and part, where it was run to its end."""
-    found = {}
+    found: dict[tuple[int, int, str], Stage] = {}
     for case, seed in _finished(root, cases, seeds, f"limits_{LIMITS[-1]}", "notebook 06"):
         folder = root / f"seed_{seed}" / f"case_{case}"
         found |= {(case, seed, part): load_stage(folder / f"limits_{part}", "notebook 06") for part in LIMITS}

@@ -148,7 +148,7 @@ def comparison(
                 if metric == "v":
                     share = max(0.0, 1 / PUBLISHED_TRAJECTORIES - 1 / trajectories[row])
                     variance = float(np.mean(runs[case, stage, f"v:{feature}:std"] ** 2))
-                    if (case, feature) in (sampling_errors or {}):
+                    if sampling_errors and (case, feature) in sampling_errors:
                         variance = PUBLISHED_TRAJECTORIES * sampling_errors[case, feature] ** 2
                     lacking = variance * share
                 low, high = prediction_interval(runs[key], lacking)

@@ -1,6 +1,5 @@
 # `make help` lists what can be asked for. The plain commands behind each target stand in README.
 PYTHON ?= python3
-SEEDS ?= 1
 MISSING ?= 0
 KILLS ?= 100
 SCALE ?= paper
@@ -19,6 +18,10 @@ help:  ## show this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-10s %s\n", $$1, $$2}'
 	@echo "Settings: SEEDS=20 CORES=2 PYTHON=python3.12, and for evidence SCALE=smoke"
 
+# Unless the command line or the environment says how many; with a default for all, the second of these would do nothing.
+reports: SEEDS ?= 1
+evidence: SEEDS ?= 20
+
 setup: $(VENV)/installed  ## create .venv and install environment.txt
 
 $(VENV)/installed: environment.txt pyproject.toml
@@ -27,13 +30,15 @@ $(VENV)/installed: environment.txt pyproject.toml
 	$(BIN)/python -m pip install --quiet --no-deps --editable .
 	touch $@
 
+$(VENV)/alternatives: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --constraint environment.txt --editable ".[alternatives]"
+	touch $@
+
 reports: setup  ## run everything at paper scale and write reports/latest/report.html
 	$(SNAKEMAKE) --config seeds=$(SEEDS) scale=paper missing=$(MISSING)
 	@echo "The report: $(CURDIR)/reports/latest/report.html"
 
-evidence: SEEDS = 20
-evidence: setup  ## twenty seeds of it, the claims, the limits, the trials and the inferred settings; resumable
-	$(BIN)/python -m pip install --quiet --constraint environment.txt --editable ".[alternatives]"
+evidence: setup $(VENV)/alternatives  ## twenty seeds of it, the claims, the limits, the trials and the inferred settings; resumable
 	$(SNAKEMAKE) --config seeds=$(SEEDS) scale=$(SCALE) missing=$(MISSING) evidence=1 $(if $(filter smoke,$(SCALE)),reports=results/smoke/report)
 
 smoke: setup  ## the same in seconds, with few epochs; the report goes to results/smoke/report/

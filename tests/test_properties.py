@@ -10,6 +10,8 @@ import json
 import math
 import os
 import pickle
+import re
+import shutil
 import time
 from pathlib import Path
 
@@ -20,10 +22,14 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from helpers import identity
 from helpers.artifacts import load_stage, save_stage, trajectories_from_table, trajectories_to_table
 from helpers.claims import load_claims
 from helpers.identity import inputs
+from helpers.limits_params import load_limits
+from helpers.nonlinear_tank import load_tank
 from helpers.params import InputError, load, load_experiments, load_identification, load_published, read_yaml
+from helpers.plant_params import load_own_plant
 from helpers.randomness import stream
 from helpers.rollout import rollout
 from helpers.sources import PROJECT
@@ -32,6 +38,14 @@ CASES = int(os.environ.get("CASES", "200"))
 SLOWEST = 20.0  # seconds of the processor: what takes longer hangs
 PARAMS = PROJECT / "params"
 FILES = sorted(path.name for path in PARAMS.glob("*.yaml"))
+NOTEBOOKS = {
+    "02_offline_irl": 1,
+    "04_knowledge_transfer": 3,
+    "05_report": None,
+    "06_limits_and_alternatives": 1,
+    "07_your_own_process": 1,
+    "08_claims": 2,
+}  # and the case with which each is run
 NAMES = (("C_A", "T"), ("C_A0", "T_E"))
 
 
@@ -151,11 +165,22 @@ def load_everything(root):
     load_experiments(root, params[1])
     load_identification(root, params[1])
     load_claims(root)
-    for notebook, case in (("02_offline_irl", 1), ("04_knowledge_transfer", 3), ("05_report", None), ("08_claims", 2)):
+    load_limits(root, params[1])
+    load_own_plant(root)
+    load_tank(root, params[1].process)
+    for notebook, case in NOTEBOOKS.items():
         inputs(notebook, root, "smoke", case)
     return params
 
 
+@pytest.fixture
+def same_versions(monkeypatch):
+    """What is installed does not depend on the files, and to ask for it again and again takes longer than all loaders."""
+    found = identity.versions()
+    monkeypatch.setattr(identity, "versions", lambda: found)
+
+
+@pytest.mark.usefixtures("same_versions")
 @some(0.4)
 @given(mutated=parameter_files())
 def test_mutated_parameter_files(folder, monkeypatch, mutated):
@@ -170,6 +195,18 @@ def test_mutated_parameter_files(folder, monkeypatch, mutated):
 
 def test_the_committed_files_pass(root):
     assert set(load_everything(root)) == {1, 2, 3}
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.usefixtures("same_versions")
+def test_every_file_is_among_those_that_are_loaded(root, tmp_path, name):
+    shutil.copytree(root, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / name
+    path.write_text(
+        "extra: {value: 1, unit: '-', source: made up, status: assumed}\n" + path.read_text(encoding="utf-8"), encoding="utf-8"
+    )
+    with pytest.raises(InputError, match=re.escape(f"{path}: ")):
+        load_everything(tmp_path)
 
 
 # Artifacts -----------------------------------------------------------------------------------------------------------

@@ -1,11 +1,14 @@
 """What may become the committed reference run, and what goes into it."""
 
 import json
+import subprocess
+from pathlib import Path
 
 import pytest
 
 from helpers import publish
 from helpers.publish import PublishError, check
+from helpers.sources import PROJECT
 
 REVISION = "0123abcd" * 5
 GOOD = {"scale": "paper", "revision": REVISION, "revisions_of_stages": [REVISION], "seeds": [0, 1], "missing_seeds": []}
@@ -118,21 +121,125 @@ def test_publishing_writes_the_numbers_into_readme(project):
     assert kept == ["# Title", "<!-- glance: a -->", "<!-- /glance -->", "middle", "<!-- time: b -->", "<!-- /time -->", "end"]
 
 
-@pytest.mark.parametrize("fault", ["no report", "smoke", "no marks in README"])
-def test_a_refused_run_changes_nothing(project, capsys, fault):
-    provenance = project / "reports/latest/provenance.json"
+@pytest.fixture
+def published(project):
+    """The same with an older reference, and a function that tells what every file holds."""
     reference = project / "reports/reference"
-    reference.mkdir()
+    (reference / "tables").mkdir(parents=True)
     (reference / "provenance.json").write_text(json.dumps(GOOD | {"seeds": [0]}))
+
+    def content():
+        return {path: path.read_bytes() for path in project.rglob("*") if path.is_file()}
+
+    return project, content
+
+
+def refused(capsys, status):
+    """The one sentence with which publishing ends."""
+    assert publish.main() == status
+    said = capsys.readouterr().err
+    assert said.startswith("error: ")
+    assert said.count("\n") == 1
+    return said
+
+
+@pytest.mark.parametrize("fault", ["no report", "smoke", "no marks in README"])
+def test_a_refused_run_changes_nothing(published, capsys, fault):
+    project, content = published
+    provenance = project / "reports/latest/provenance.json"
     if fault == "no report":
         provenance.unlink()
     elif fault == "smoke":
         provenance.write_text(json.dumps(GOOD | {"scale": "smoke"}))
     else:
         (project / "README.md").write_text("no marks")
-    before = {path: path.read_bytes() for path in project.rglob("*") if path.is_file()}
-    assert publish.main() == 2
-    said = capsys.readouterr().err
-    assert said.startswith("error: ")
-    assert said.count("\n") == 1
-    assert {path: path.read_bytes() for path in project.rglob("*") if path.is_file()} == before
+    before = content()
+    refused(capsys, 2)
+    assert content() == before
+
+
+@pytest.mark.parametrize(
+    ("copy", "mark"),
+    [
+        ("results/paper/seed_0/case_1/notebooks/02_offline_irl_printed.ipynb", "02_offline_irl_printed.failed"),
+        ("reports/latest/notebooks/05_report.ipynb", "05_report.failed"),
+    ],
+)
+def test_a_copy_of_a_notebook_that_failed_is_not_published(published, capsys, copy, mark):
+    project, content = published
+    (project / copy).with_name(mark).write_text("02_offline_irl: ZeroDivisionError")
+    before = content()
+    assert f"{project / copy}: failed when it was run last" in refused(capsys, 2)
+    assert content() == before
+
+
+@pytest.mark.parametrize("table", ["claims.csv", "limits_gaps.csv"])
+def test_a_report_without_the_evidence_of_the_published_one_does_not_replace_it(published, capsys, table):
+    project, content = published
+    (project / "reports/reference/tables" / table).touch()
+    before = content()
+    assert f"the run lacks tables/{table}, which the published one has" in refused(capsys, 2)
+    assert content() == before
+    (project / "reports/latest/tables" / table).touch()
+    assert publish.main() == 0
+
+
+@pytest.mark.parametrize("part", ["figures", "seeds.csv", "tables/time.csv", "notebooks/05_report.ipynb"])
+def test_a_report_that_lacks_a_part_ends_in_a_sentence_and_changes_nothing(published, capsys, part):
+    project, content = published
+    path = project / "reports/latest" / part
+    path.rename(project / "elsewhere")
+    before = content()
+    assert f"{path}: could not be published: No such file" in refused(capsys, 1)
+    assert content() == before
+    assert sorted(found.name for found in (project / "reports").iterdir()) == ["latest", "reference"]
+
+
+def test_a_folder_that_cannot_be_copied_ends_in_a_sentence(published, capsys):
+    project, content = published
+    (project / "reports/latest/figures/gone.png").symlink_to("nowhere")
+    before = content()
+    assert "figures/gone.png: could not be published: " in refused(capsys, 1)
+    assert content() == before
+
+
+@pytest.mark.parametrize("left", ["partial", "partial and reference aside", "reference aside, new one in place"])
+def test_a_kill_at_any_moment_loses_no_reference(published, capsys, left):
+    project, content = published
+    reports = project / "reports"
+    expected = content()
+    if "partial" in left:
+        (reports / ".reference.partial").mkdir()
+        (reports / ".reference.partial/report.html").touch()
+    if left == "partial and reference aside":
+        (reports / "reference").rename(reports / ".reference.old")
+    elif left.startswith("reference"):
+        (reports / ".reference.old").mkdir()
+        (reports / ".reference.old/provenance.json").touch()
+    (project / "reports/latest/provenance.json").rename(project / "provenance.json")  # so that nothing is published
+    refused(capsys, 2)
+    (project / "provenance.json").rename(project / "reports/latest/provenance.json")
+    assert content() == expected
+
+
+def test_a_reference_that_cannot_be_replaced_stays(published, capsys, monkeypatch):
+    _, content = published
+    before, rename = content(), Path.rename
+
+    def refusing(path, target):
+        if path.name == ".reference.partial":
+            raise OSError(28, "No space left on device", str(target))
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", refusing)
+    assert "No space left on device" in refused(capsys, 1)
+    assert content() == before
+
+
+def test_git_sees_nothing_of_what_a_kill_leaves_beside_the_reference():
+    """Otherwise the code would count as changed, and every later publishing be refused."""
+    left = [f"reports/.reference.{word}/report.html" for word in ("partial", "old")]
+    ignored = subprocess.run(["git", "check-ignore", "--no-index", *left], cwd=PROJECT, capture_output=True, text=True, check=False)
+    if ignored.returncode == 128:
+        pytest.skip("no checkout")
+    assert ignored.stdout.split() == left

@@ -126,6 +126,22 @@ def test_no_executed_copy_is_written_over_what_the_project_is_made_of(monkeypatc
     assert everything_below(here) == ["link"]
 
 
+@pytest.mark.parametrize("folder", ["template", "reference", "latest/../template/deep"])
+def test_no_run_writes_over_the_committed_part_of_the_reports(monkeypatch, here, capfd, folder):
+    monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, **__: pytest.fail("the notebook was run"))
+    (here / "link").symlink_to(PROJECT)
+    before = [everything_below(PROJECT / part) for part in run.COMMITTED]
+    for project in (PROJECT, here / "link"):
+        place = str(project / "reports" / folder)
+        for name, arguments in (("output", [f"{place}/report.css"]), ("output_root", ["x.ipynb", "-p", "output_root", place])):
+            assert run.main(["05_report", *arguments]) == 2
+            said = capfd.readouterr().err
+            assert said.startswith(f"error: parameter '{name}': no run writes into reports/template/ and reports/reference/")
+            assert said.count("\n") == 1
+    assert [everything_below(PROJECT / part) for part in run.COMMITTED] == before
+    assert everything_below(here) == ["link"]
+
+
 def test_roots_are_those_of_the_callers_directory(monkeypatch, here):
     """The kernel works elsewhere; a folder may also be named like a number."""
     handed = {}
@@ -134,6 +150,23 @@ def test_roots_are_those_of_the_callers_directory(monkeypatch, here):
     roots = [["params_root", "2024"], ["output_root", "out"], ["input_root", str(here / "in")]]
     assert run.main(["01_demonstrations", "x.ipynb", *(word for root in roots for word in ("-p", *root))]) == 0
     assert handed == {name: str(here / Path(folder).name) for name, folder in roots}
+
+
+def test_a_damaged_parameter_file_is_marked_for_the_summary_and_the_older_copy_stays(monkeypatch, here, capfd):
+    monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, **__: None)
+    params = shutil.copytree(PROJECT / "params", here / "params") / "process.yaml"
+    good = params.read_text(encoding="utf-8")
+    params.write_text("extra: 1\n" + good, encoding="utf-8")
+    (here / "01.ipynb").write_text("an older run")
+    arguments = ["01_demonstrations", "01.ipynb", "-p", "case", "2", "-p", "params_root", "params"]
+    assert run.main(arguments) == 2
+    said = capfd.readouterr().err
+    assert said.startswith(f"error: 01_demonstrations case=2: {params}: ")
+    assert said == f"error: {(here / '01.failed').read_text()}"
+    assert (here / "01.ipynb").read_text() == "an older run"
+    params.write_text(good, encoding="utf-8")
+    assert run.main(arguments) == 0
+    assert not (here / "01.failed").exists()
 
 
 def test_a_missing_result_ends_in_a_sentence_and_keeps_the_executed_copy(here, capfd):
@@ -316,6 +349,42 @@ def test_a_change_to_what_the_report_alone_reads_leaves_every_stage_as_it_is(pla
     text = (plan.folder / changed).read_text(encoding="utf-8")
     (plan.folder / changed).write_text(text.replace(old, new, 1), encoding="utf-8")
     assert [name for name, inputs in made_from().items() if inputs != before[name]] == ["05_report"]
+
+
+def test_results_that_were_removed_are_made_again_whatever_else_has_changed(finished):
+    shutil.rmtree(finished.folder / "results")
+    path = finished.folder / "src/helpers/report.py"
+    path.write_text(path.read_text(encoding="utf-8").replace("RUNNERS = (", "RUNNERS = (*(),", 1), encoding="utf-8")
+    assert finished() == ONE_SEED
+
+
+@pytest.mark.parametrize("name", ["summary.md", "machine.md", "scaling.svg"])
+def test_what_make_bench_wrote_last_goes_into_the_report(finished, name):
+    folder = finished.folder / "reports/reference/benchmarks"
+    folder.mkdir(parents=True)
+    (folder / name).touch()
+    assert finished() == {"report": 1}
+    os.utime(folder / name, (1000, 1000))
+    assert finished() == {}
+
+
+@pytest.mark.parametrize(
+    ("scale", "says"),
+    [("smoke", "\n1 notebook(s) failed; "), ("huge", "\nNo notebook failed, what went wrong stands above; ")],
+    ids=["a parameter file", "the command"],
+)
+def test_the_summary_tells_what_was_refused_before_it_ran(plan, scale, says):
+    path = plan.folder / "params/case_2.yaml"
+    if scale == "smoke":
+        path.write_text(path.read_text(encoding="utf-8") + "extra: 1\n", encoding="utf-8")
+    command = [sys.executable, "-m", "snakemake", "--profile", "profiles/local", "--cores", "1", "--config", f"scale={scale}"]
+    target = f"results/{scale}/seed_0/case_2/demonstrations/record.json"
+    environment = {**os.environ, "PYTHONPATH": str(plan.folder / "src")}
+    done = subprocess.run([*command, "--", target], cwd=plan.folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert says in done.stderr
+    said = done.stderr[done.stderr.index(says) :]
+    assert ("case_2.yaml: " in said) is (scale == "smoke")
 
 
 def test_a_damaged_record_is_made_again(finished):

@@ -2,6 +2,7 @@
 
 import pandas as pd
 import pytest
+import torch
 
 from helpers.nonlinear_tank import example, load_tank
 from helpers.params import load
@@ -9,7 +10,7 @@ from helpers.plant_data import read_records
 from helpers.plant_description import load_description
 from helpers.randomness import stream
 from helpers.sources import PROJECT
-from helpers.tank_history import AUTOMATIC, BAD, FILE, MANUAL, Plan, record, spoil
+from helpers.tank_history import AUTOMATIC, BAD, FILE, MANUAL, START, Plan, record, spoil
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +48,18 @@ def test_the_operator_moves_the_inputs_and_hands_them_back_without_a_jump(record
     assert table["TC101.OP"][last + 1] == pytest.approx(table["TC101.OP"][last], abs=1e-9)
 
 
+def test_the_stamps_are_in_the_time_unit_of_the_tank(root):
+    params = load(root, 1)
+    tank, tank_params = load_tank(root, params.process)
+    settings = tank_params.history.model_copy(update={"cycles": 1, "rest": 4, "hold": 4, "manual_samples": 4})
+    plan = Plan.draw(settings, params.case.set_point, stream(0, "plan"))
+    steps = {}
+    for unit in ("s", "min"):
+        tank.time_unit = unit
+        steps[unit] = record(tank, settings, plan, stream(0, "record"))["TIME"].diff().iloc[1].total_seconds()
+    assert steps == {"s": pytest.approx(0.04), "min": pytest.approx(2.4)}
+
+
 def test_the_pi_brings_the_tank_to_its_set_points(recorded):
     settings, _, table = recorded
     end = table.iloc[settings.rest + settings.hold - 20 : settings.rest + settings.hold]
@@ -65,6 +78,33 @@ def test_the_recording_suffers_every_kind_of_fault(recorded):
     assert ((steps > 2.5) & (steps < 4)).sum() >= 2
     same = [pd.to_numeric(spoilt[tag], errors="coerce").diff().eq(0) for tag in ("AC101.PV", "TC101.PV")]
     assert (same[0] | same[1]).sum() >= 29
+
+
+def test_the_committed_file_begins_and_ends_as_it_would_be_written_now(root):
+    """The whole takes eight seconds. Its end is recorded from four set point steps before: the loop forgets where it began.
+
+    No fault of the recording strikes the first 100 rows or begins in the last 100, and none lasts longer than 45.
+    """
+    params = load(root, 1)
+    tank, tank_params = load_tank(root, params.process)
+    settings = tank_params.history
+    written = pd.read_csv(FILE, na_values=BAD)
+
+    def recorded_again(first, last):
+        generator = stream(0, "tank history")
+        plan = Plan.draw(settings, params.case.set_point, generator)
+        torch.randn(first, 2, 1, tank.n_states, generator=generator, dtype=torch.float64)  # the noise of the samples before
+        part = Plan(plan.set_point[first:last], plan.by_hand[first:last], plan.drift[first:last])
+        return record(tank, settings, part, generator)
+
+    n_samples = (settings.rest + settings.hold) * settings.cycles
+    last = recorded_again(n_samples - 4 * (settings.rest + settings.hold), n_samples).tail(50)
+    seconds = [(pd.Timestamp(time) - START).total_seconds() for time in written["TIME"].tail(50)]
+    assert seconds == pytest.approx([60 * tank.sampling_time * sample for sample in range(n_samples - 50, n_samples)])
+    for found, expected in ((written.head(100), recorded_again(0, 100)), (written.tail(50), last)):
+        assert found["MODE"].tolist() == expected["MODE"].tolist()
+        for tag in found.select_dtypes("number"):
+            assert found[tag].to_numpy() == pytest.approx(expected[tag].to_numpy(), abs=6e-4), tag  # three or four decimals
 
 
 def test_the_committed_file_is_small_and_reads_as_it_is_described():

@@ -3,7 +3,7 @@
 import json
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -91,45 +91,103 @@ def fill(text: str, block: str, content: str) -> str:
     return f"{head}{found}{mark}{closed}{content}\n{ended}{tail}"
 
 
+def check_copies(copies: Iterable[Path]) -> None:
+    """Refuse executed copies of notebooks that failed: a mark beside each says so."""
+    if failed := [path for path in copies if path.with_suffix(".failed").exists()]:
+        raise PublishError(f"{', '.join(map(str, failed))}: failed when it was run last; run make reports or make evidence again")
+
+
+def check_tables(latest: Path, reference: Path) -> None:
+    """Refuse a report without the claims or the limits that the published one has."""
+    tables = [f"tables/{name}.csv" for name in ("claims", "limits_gaps")]
+    if missing := [name for name in tables if (reference / name).exists() and not (latest / name).exists()]:
+        raise PublishError(f"{latest}: the run lacks {' and '.join(missing)}, which the published one has; run make evidence")
+
+
+def executed_copies(first: Path) -> dict[str, Path]:
+    """The executed copies to publish, by their published names; `first` is the folder of the first seed's results."""
+    copies = {
+        f"{path.stem.removesuffix('_improved')}_{path.parents[1].name}.ipynb": path
+        for path in sorted(first.glob("case_*/notebooks/[!.]*.ipynb"))
+    }
+    copies["05_report.ipynb"] = LATEST / "notebooks/05_report.ipynb"
+    if (first / "inferred_settings").is_dir():
+        copies["00_inferred_settings.ipynb"] = first / "notebooks/00_inferred_settings.ipynb"
+    return copies
+
+
+def publish() -> None:
+    """Check the last run, put it in the place of the reference and its numbers into README.
+
+    Raises:
+        PublishError, OSError: if the run may not be published, or cannot be.
+    """
+    latest = read_provenance(LATEST)
+    reference = read_provenance(REFERENCE) if (REFERENCE / "provenance.json").is_file() else None
+    check(latest, reference, code_revision(PROJECT))
+    check_tables(LATEST, REFERENCE)
+    first = RESULTS / latest["scale"] / f"seed_{latest['seeds'][0]}"
+    copies = executed_copies(first)
+    check_copies(copies.values())
+    readme = PROJECT / "README.md"
+    text = fill(readme.read_text(encoding="utf-8"), "glance", glance(pd.read_csv(LATEST / "tables/gaps.csv")))
+    text = fill(text, "time", time_by_stage(pd.read_csv(LATEST / "tables/time.csv")))
+    partial, old = _beside("partial"), _beside("old")
+    for part in PARTS:
+        _copy(LATEST / part, partial / part)
+    for name, path in copies.items():
+        _copy(path, partial / "notebooks" / name)
+    if (first / "inferred_settings").is_dir():
+        _copy(first / "inferred_settings", partial / "inferred_settings")
+    for part in ("benchmarks", "inferred_settings", "reliability.md"):  # runs of their own, which stay
+        if (REFERENCE / part).exists() and not (partial / part).exists():
+            _copy(REFERENCE / part, partial / part)
+    if REFERENCE.exists():
+        REFERENCE.rename(old)
+    partial.rename(REFERENCE)
+    readme.write_text(text, encoding="utf-8")
+
+
+def _beside(word: str) -> Path:
+    """A hidden folder beside the reference, which git ignores."""
+    return REFERENCE.with_name(f".reference.{word}")
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy a file or a folder, with its times."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if source.is_dir():
+        shutil.copytree(source, target)
+    else:
+        shutil.copy2(source, target)
+
+
+def _tidy() -> None:
+    """Remove what a publish left half done; the old reference comes back where the new one did not take its place."""
+    shutil.rmtree(_beside("partial"), ignore_errors=True)
+    if _beside("old").is_dir() and not REFERENCE.exists():
+        _beside("old").rename(REFERENCE)
+    shutil.rmtree(_beside("old"), ignore_errors=True)
+
+
 def main() -> int:
     """Publish; returns the exit status."""
     try:
-        latest = read_provenance(LATEST)
-        reference = read_provenance(REFERENCE) if (REFERENCE / "provenance.json").is_file() else None
-        check(latest, reference, code_revision(PROJECT))
-        readme = PROJECT / "README.md"
-        text = fill(
-            readme.read_text(encoding="utf-8"),
-            "glance",
-            glance(pd.read_csv(LATEST / "tables/gaps.csv")),
-        )
-        text = fill(text, "time", time_by_stage(pd.read_csv(LATEST / "tables/time.csv")))
+        _tidy()  # after one that was killed
+        try:
+            publish()
+        finally:
+            _tidy()
     except PublishError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    partial = REFERENCE.with_name(".reference.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    for part in PARTS:
-        copy = shutil.copytree if (LATEST / part).is_dir() else shutil.copy2
-        partial.mkdir(parents=True, exist_ok=True)
-        copy(LATEST / part, partial / part)
-    (partial / "notebooks").mkdir()
-    first = RESULTS / latest["scale"] / f"seed_{latest['seeds'][0]}"
-    for path in sorted(first.glob("case_*/notebooks/[!.]*.ipynb")):
-        case = path.parents[1].name
-        shutil.copy2(path, partial / "notebooks" / f"{path.stem.removesuffix('_improved')}_{case}.ipynb")
-    shutil.copy2(LATEST / "notebooks/05_report.ipynb", partial / "notebooks")
-    inferred = first / "inferred_settings"
-    if inferred.is_dir():
-        shutil.copytree(inferred, partial / "inferred_settings")
-        shutil.copy2(first / "notebooks/00_inferred_settings.ipynb", partial / "notebooks")
-    for part in ("benchmarks", "inferred_settings", "reliability.md"):  # runs of their own, which stay
-        if (REFERENCE / part).exists() and not (partial / part).exists():
-            copy = shutil.copytree if (REFERENCE / part).is_dir() else shutil.copy2
-            copy(REFERENCE / part, partial / part)
-    shutil.rmtree(REFERENCE, ignore_errors=True)
-    partial.rename(REFERENCE)
-    readme.write_text(text, encoding="utf-8")
+    except shutil.Error as error:  # of a folder: source, target and reason of each file; the first will do
+        source, _, why = error.args[0][0]
+        print(f"error: {source}: could not be published: {why}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f"error: {error.filename or LATEST}: could not be published: {error.strerror or error}", file=sys.stderr)
+        return 1
     print(f"published: {REFERENCE}")
     return 0
 

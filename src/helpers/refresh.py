@@ -32,7 +32,10 @@ def main() -> int:
     os.environ.pop("MPLBACKEND", None)  # the kernel's own, which puts pictures into the notebook
     make_inputs()
     for path in sorted(NOTEBOOKS.glob("[0-9]*.ipynb")):
-        execute(path.stem, path, {})
+        with tempfile.TemporaryDirectory(prefix=".refresh_", dir=NOTEBOOKS) as folder:  # a run that fails leaves the notebook alone
+            copy = Path(folder) / path.name
+            execute(path.stem, copy, {})
+            copy.replace(path)
         print(f"refreshed: {path.relative_to(PROJECT)}")
     return 0
 

@@ -31,6 +31,7 @@ from helpers.sources import PROJECT
 
 NOTEBOOKS = PROJECT / "notebooks"
 DAY = 86400.0  # seconds
+COMMITTED = ("reports/template", "reports/reference")  # where no notebook writes: people do, and make publish, bench and torture
 HEADLINE = "improved"  # the variant behind the report's numbers; cells with this tag are run for it alone
 
 
@@ -78,6 +79,14 @@ def execute(notebook: str, output: Path, parameters: dict[str, Any]) -> None:
                     partial.replace(output)
                 except nbformat.reader.NotJSONError:  # half-written, because the disk is full: what went wrong is on its way
                     partial.unlink()
+
+
+def _check_not_committed(name: str, place: Path) -> None:
+    """Refuse a place among the committed part of reports/, which `check_place` lets through. Links and dots are resolved first."""
+    found = place.resolve()
+    if any(found.is_relative_to(PROJECT / folder) for folder in COMMITTED):
+        where = " and ".join(f"{folder}/" for folder in COMMITTED)
+        raise SessionError(f"parameter '{name}': no run writes into {where}, which are committed, and so not to {found}")
 
 
 def _forget_dead_sockets() -> None:
@@ -142,13 +151,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.environ.pop("MPLBACKEND", None)  # the kernel's own, which puts pictures into the notebook
     what = " ".join([given.notebook, *(f"{name}={value}" for name, value in parameters.items() if not name.endswith("_root"))])
     failed = given.output.with_suffix(".failed")  # what went wrong, for the summary at the end of a long run
+    status = 1
     try:
         check_place("output", given.output)
+        _check_not_committed("output", given.output)
+        _check_not_committed("output_root", Path(str(parameters.get("output_root") or PROJECT / "results")))
         failed.unlink(missing_ok=True)
         execute(given.notebook, given.output, parameters)
-    except (ParameterError, SessionError) as error:
+    except SessionError as error:  # in the command itself, perhaps in its place: nothing is written
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except ParameterError as error:
+        status, sentence = 2, f"{what}: {error}"
     except PapermillExecutionError as error:
         sentence = f"{what}: {error.ename}: {error.evalue} (executed copy with the traceback: {given.output})"
     except DeadKernelError:
@@ -160,9 +174,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"done: {what}")
         return 0
     print(f"error: {sentence}", file=sys.stderr)
-    with suppress(OSError):  # the disk may be full
+    with suppress(OSError):  # the disk may be full; or there is no folder, if nothing was run
         failed.write_text(f"{sentence}\n", encoding="utf-8")
-    return 1
+    return status
 
 
 if __name__ == "__main__":

@@ -67,9 +67,9 @@ def test_one_seed_shows_its_monte_carlo_interval(results):
     worst = found["limits_robustness"].set_index(["case", "controller"])["model"]
     assert (worst["I", "offset-free MPC"], worst["I", "PID (demonstrator)"]) == ("100", "100")
     quality = found["limits_quality"].iloc[0]
-    assert (quality["IAE, $T^*$ (time)"], quality["settling time, 5 %, $T^*$ (time)"]) == ("10.0", "–")
-    assert list(quality.index) == ["case", "controller", "IAE, $T^*$ (time)", "settling time, 5 %, $T^*$ (time)"]
-    assert found["limits_safety"].set_index(["case", "controller"]).loc[("I", "hot start"), "worst episode ($J$)"] == "10.0"
+    assert (quality["IAE, $T^*$ (time)"], quality["Settling time, 5 %, $T^*$ (time)"]) == ("10.0", "–")
+    assert list(quality.index) == ["case", "controller", "IAE, $T^*$ (time)", "Settling time, 5 %, $T^*$ (time)"]
+    assert found["limits_safety"].set_index(["case", "controller"]).loc[("I", "hot start"), "Worst episode ($J$)"] == "10.0"
 
 
 def test_several_seeds_show_medians(results):

@@ -16,21 +16,21 @@ PLACES = 4  # digits after the point that count
 FIGURES = {  # of control quality, with their units; the errors are normalised
     "iae": "IAE (time)",
     "iae_worst": "IAE, worst 5 % (time)",
-    "offset": "offset (share of the change)",
-    "overshoot": "overshoot (share of the change)",
-    "settling_time_5": "settling time, 5 % (time)",
-    "total_variation": "total variation (deviation)",
-    "at_bound": "at a bound (share of time)",
+    "offset": "Offset (share of the change)",
+    "overshoot": "Overshoot (share of the change)",
+    "settling_time_5": "Settling time, 5 % (time)",
+    "total_variation": "Total variation (deviation)",
+    "at_bound": "At a bound (share of time)",
     "harris": "Harris index",
 }
 SAFETY = {  # of the online epochs, with their units
-    "episodes": "episodes",
-    "worst": "worst episode ($J$)",
-    "worst_expert": "the PID's worst ($J$)",
-    "worse": "worse than the PID (share)",
-    "regret": "regret ($J$)",
-    "regret_episodes": "regret (episodes of the PID)",
-    "regret_peak": "greatest regret on the way ($J$)",
+    "episodes": "Episodes",
+    "worst": "Worst episode ($J$)",
+    "worst_expert": "Of the PID ($J$)",
+    "worse": "Worse (share)",
+    "regret": "Regret ($J$)",
+    "regret_episodes": "Regret (episodes of the PID)",
+    "regret_peak": "Greatest on the way ($J$)",
 }
 GROUPS = {"model": "model", "noise": "noise", "set_point": "set points", "time": "dead time and load"}
 THE_PAPERS = "irl_reinforce"

@@ -157,7 +157,6 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
     Args:
         tabulated: what `tabulate` gave for these results, if it was asked before.
     """
-    page = folder / "report.html"
     partial = beside(folder / "report")
     try:
         sweep(folder / "report")
@@ -198,7 +197,7 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
         raise ArtifactError(f"{folder}: the report could not be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return page
+    return folder / "report.html"
 
 
 def shortened(drawing: str) -> str:

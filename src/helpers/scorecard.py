@@ -147,9 +147,10 @@ def comparison(
                 lacking = 0.0
                 if metric == "v":
                     share = max(0.0, 1 / PUBLISHED_TRAJECTORIES - 1 / trajectories[row])
-                    variance = float(np.mean(runs[case, stage, f"v:{feature}:std"] ** 2))
-                    if sampling_errors and (case, feature) in sampling_errors:
-                        variance = PUBLISHED_TRAJECTORIES * sampling_errors[case, feature] ** 2
+                    if error := (sampling_errors or {}).get((case, feature)):
+                        variance = PUBLISHED_TRAJECTORIES * error**2
+                    else:
+                        variance = float(np.mean(runs[case, stage, f"v:{feature}:std"] ** 2))
                     lacking = variance * share
                 low, high = prediction_interval(runs[key], lacking)
                 ours = found.loc[key]

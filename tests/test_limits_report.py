@@ -10,6 +10,7 @@ from helpers import limits_report
 from helpers.artifacts import load_stage, save_stage
 from helpers.collection import LIMITS
 from helpers.params import load
+from helpers.report import stacked
 from helpers.sources import PROJECT
 from helpers.tables import to_markdown
 
@@ -40,13 +41,14 @@ def write(folder, level):
     objectives = {"0": [19.0, 1.0, 15.0], "500": [19.0, level, level + 2]}
     budget = pd.DataFrame({"learner": ["mpc", "ppo", "irl_reinforce"], **objectives})
     save_stage(folder / "limits_budget", {}, {"curves.csv": curves, "budget.csv": budget})
-    quality = pd.DataFrame({"controller": "mpc", "figure": ["iae:T", "settling_time_5:T", "itae:T"], "value": [level, None, 1.0]})
+    values = {"iae:T": level, "settling_time_5:T": None, "offset:T": 0.012, "overshoot_single:T": 0.1, "harris:T": 0.9}
+    quality = pd.DataFrame({"controller": "mpc", "figure": list(values), "value": list(values.values())})
     save_stage(folder / "limits_quality", {}, {"quality.csv": quality})
     there = (("expert", 10.0, 10.0), ("mpc", 10.0, 20.0), ("online", 8.0, 16.0))
     cells = [("model", row, "1", name, values[int(row) - 1]) for row in "12" for name, *values in there]
     robust = pd.DataFrame(cells, columns=["group", "row", "column", "controller", "objective"]).assign(standard_error=0.0)
-    names = ["expert", "online_there"]
-    improved = pd.DataFrame({"state": 1.3, "input": 0.7, "controller": names, "objective": [1.0, level]})
+    there = {"expert": 1.0, "minimum_variance": 15.0, "online_there": level}
+    improved = pd.DataFrame({"state": 1.3, "input": 0.7, "controller": list(there), "objective": list(there.values())})
     save_stage(folder / "limits_robustness", {}, {"robustness.csv": robust, "improved.csv": improved})
     safety = pd.DataFrame({"run": ["hot", "scratch"], "worst": [level, 0.0], "worse": [0.5, 1.0]})
     save_stage(folder / "limits_safety", {}, {"safety.csv": safety})
@@ -66,9 +68,10 @@ def test_one_seed_shows_its_monte_carlo_interval(results):
     assert budget.loc[("II", "PPO from scratch")].tolist() == ["1.00", "20.00"]
     worst = found["limits_robustness"].set_index(["case", "controller"])["model"]
     assert (worst["I", "offset-free MPC"], worst["I", "PID (demonstrator)"]) == ("100", "100")
-    quality = found["limits_quality"].iloc[0]
-    assert (quality["IAE, $T^*$ (time)"], quality["Settling time, 5 %, $T^*$ (time)"]) == ("10.0", "–")
-    assert list(quality.index) == ["case", "controller", "IAE, $T^*$ (time)", "Settling time, 5 %, $T^*$ (time)"]
+    assert found["limits_errors"].iloc[0].to_dict() == {"case": "I", "controller": "offset-free MPC", "IAE, $T^*$ (time)": "10.000"}
+    response = {"Settling, 5 %, $T^*$ (time)": "–", "Offset, $T^*$ (%)": "1.2"}
+    assert found["limits_response"].iloc[0].to_dict() == {"case": "I", "controller": "offset-free MPC"} | response
+    assert found["limits_inputs"]["Harris index, $T^*$"].tolist() == ["0.90", "0.90"]
     assert found["limits_safety"].set_index(["case", "controller"]).loc[("I", "hot start"), "Worst episode ($J$)"] == "10.0"
 
 
@@ -81,6 +84,21 @@ def test_several_seeds_show_medians(results):
     assert line.get_ydata().tolist() == [1.0, 11.0]
 
 
+@pytest.mark.parametrize(
+    ("times", "shown"),
+    [
+        ([0.1, 0.2, 0.3, 0.4, None], "0.30 [0.10, –]"),
+        ([0.1, 0.2, None, None, None], "–"),
+        ([0.1, 0.2, None, None], "–"),  # one of the two in the middle never came there
+        ([0.2] * 5, "0.20"),
+    ],
+)
+def test_what_a_seed_never_reached_counts_as_long(times, shown):
+    rows = pd.DataFrame({"case": 1, "seed": range(len(times)), "controller": "mpc", "metric": "rise_time:T", "value": times})
+    table = limits_report._quality(rows, limits_report.QUALITY["response"])
+    assert table["Rise 10-90 %, $T^*$ (time)"].tolist() == [shown]
+
+
 def test_the_papers_way_beside_its_rivals(results):
     pairs = limits_report.tabulate(results(1))["limits_pairs"].set_index(["case", "rival"])
     assert pairs.loc[("I", "PPO from scratch")].tolist() == ["14.00", "2.00"]
@@ -91,6 +109,12 @@ def test_the_papers_way_beside_its_rivals(results):
 def test_the_plants_that_were_improved_on(results):
     improved = limits_report.tabulate(results(1))["limits_improved"].set_index(["case", "controller"])
     assert improved.loc[("II", "improved on that plant"), "A x 1.3, B x 0.7"] == "20.0"
+
+
+def test_where_improving_on_the_plant_beats_a_wrong_model(results):
+    assert limits_report.improved_there(results(1, written=False)) == {}
+    assert limits_report.improved_there(results(4)) == {}  # too few for an interval
+    assert limits_report.improved_there(results(5)) == {"A x 1.3, B x 0.7": [2]}  # 20 to 24 in Case II, 10 to 14 in Case I
 
 
 def test_what_a_practitioner_reads(results):
@@ -135,11 +159,14 @@ def test_the_section_of_the_template(results):
     start = text.index("{% if tables.limits_gaps is defined %}")
     section = text[start : text.index("{% if benchmarks %}", start)]
     environment = Environment(loader=FileSystemLoader("."), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {"table": to_markdown, "numeral": lambda case: "I" * case}
+    environment.filters |= {"table": to_markdown, "numeral": lambda case: "I" * case, "stacked": stacked}
+    environment.globals["studies"] = lambda cases: " and ".join("I" * case for case in cases)
     run = results(1)
     shown = {"tables": limits_report.tabulate(run), "answers": limits_report.answers(run), "cases": run.params, "n_seeds": 1}
     shown |= {"standings": limits_report.standings(run), "fewest": 5, "ranges": limits_report.ranges(run)}
+    shown |= {"improved_there": {"A x 1.3, B x 0.7": [2]}}
     rendered = environment.from_string(section).render(shown)
     assert "10.0 [9.0, 11.0]" in rendered
     assert "figures/limits_budget_case_2.svg" in rendered
+    assert "- A x 1.3, B x 0.7: II\n" in rendered
     assert environment.from_string(section).render(tables={}, cases=run.params, n_seeds=1).strip() == ""

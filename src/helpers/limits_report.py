@@ -1,6 +1,6 @@
 """The section of the report on limits and alternatives: tables and figures from what notebook 06 wrote, where it was run."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -10,18 +10,30 @@ from helpers.collection import Results
 from helpers.limits_answer import NO_LEARNERS, WITH_MODEL, answer
 from helpers.limits_figures import LABELS, budget_curves, gap_figure, heat_maps
 from helpers.statistics import FEWEST, median_interval
-from helpers.tables import ROMAN, spread, symbol
+from helpers.tables import NOT_KNOWN, ROMAN, spread, symbol
 
 PLACES = 4  # digits after the point that count
-FIGURES = {  # of control quality, with their units; the errors are normalised
-    "iae": "IAE (time)",
-    "iae_worst": "IAE, worst 5 % (time)",
-    "offset": "Offset (share of the change)",
-    "overshoot": "Overshoot (share of the change)",
-    "settling_time_5": "Settling time, 5 % (time)",
-    "total_variation": "Total variation (deviation)",
-    "at_bound": "At a bound (share of time)",
-    "harris": "Harris index",
+NEVER = 1e9  # stands for a time that a response never came to, so that it counts as long
+# Of each table of control quality its figures: header with unit, factor, digits after the point.
+QUALITY: dict[str, dict[str, tuple[str, int, int]]] = {
+    "errors": {
+        "ise": ("ISE (time)", 1, 3),
+        "iae": ("IAE (time)", 1, 3),
+        "itae": ("ITAE (time²)", 1, 3),
+        "iae_worst": ("IAE, worst 5 % (time)", 1, 3),
+    },
+    "response": {
+        "offset": ("Offset (%)", 100, 1),
+        "overshoot": ("Overshoot (%)", 100, 1),
+        "rise_time": ("Rise 10-90 % (time)", 1, 2),
+        "settling_time_2": ("Settling, 2 % (time)", 1, 2),
+        "settling_time_5": ("Settling, 5 % (time)", 1, 2),
+    },
+    "inputs": {
+        "total_variation": ("Total variation (deviation)", 1, 0),
+        "at_bound": ("At a bound (% of time)", 100, 1),
+        "harris": ("Harris index", 1, 2),
+    },
 }
 SAFETY = {  # of the online epochs, with their units
     "episodes": "Episodes",
@@ -60,7 +72,6 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     plants = [f"A x {state:g}, B x {entry:g}" for state, entry in zip(there["state"], there["input"], strict=True)]
     there = there.assign(metric=plants).rename(columns={"objective": "value"})
     quality = read(results, "quality", "quality.csv").rename(columns={"figure": "metric"})
-    kept = quality["metric"].str.split(":").str[0].isin(FIGURES)
     safety = read(results, "safety", "safety.csv").melt(["case", "seed", "run"], var_name="metric")
     return {
         "limits_gaps": _gaps(gaps),
@@ -68,7 +79,7 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
         "limits_pairs": _wide(_ahead(listed), int, "after {:,}", decimals=2).rename(columns={"controller": "rival"}),
         "limits_robustness": _wide(_worst(results).rename(columns={"group": "metric"}), str, "{}", GROUPS, decimals=0),
         "limits_improved": _wide(there, str, "{}", decimals=1),
-        "limits_quality": _wide(quality[kept], str, "{}", {name: _figure_header(name) for name in quality["metric"].unique()}),
+        **{f"limits_{table}": _quality(quality, figures) for table, figures in QUALITY.items()},
         "limits_safety": _wide(safety.rename(columns={"run": "controller"}), str, "{}", SAFETY, RUNS),
     } | ({"limits_curves": budget} if len(budget) else {})
 
@@ -115,6 +126,23 @@ def price(results: Results) -> dict[int, dict[str, float]]:
     online = _worst(results).query("controller == 'online'")
     worst = online.pivot_table(index="case", columns="group", values="value", aggfunc="median")
     return worst.reindex(columns=["set_point", "model"]).assign(worse=worse).to_dict("index")
+
+
+def improved_there(results: Results) -> dict[str, list[int]]:
+    """By mismatched plant: the cases in which improving there ends ahead of minimum variance with the wrong model.
+
+    By the whole interval of the difference within seeds; empty where notebook 06 was not run or for too few seeds.
+    """
+    there = read(results, "robustness", "improved.csv")
+    if there.empty or there["seed"].nunique() < FEWEST:
+        return {}
+    found: dict[str, list[int]] = {}
+    for (state, entry, case), rows in there.groupby(["state", "input", "case"], sort=False):
+        reached = rows.pivot_table(index="seed", columns="controller", values="objective")
+        cases = found.setdefault(f"A x {state:g}, B x {entry:g}", [])
+        if _low(reached["online_there"] - reached["minimum_variance"]) > 0:
+            cases.append(int(case))
+    return found
 
 
 def _summary(frame: pd.DataFrame) -> pd.DataFrame:
@@ -224,7 +252,7 @@ def _wide(
     header: str,
     words: dict[str, str] | None = None,
     names: dict[str, str] | None = None,
-    decimals: int | None = None,
+    decimals: int | Mapping[str, int] | None = None,
 ) -> pd.DataFrame:
     """Medians of long rows (case, seed, controller, metric, value): a row for each case and controller, a column a metric."""
     found = _summary(frame.assign(value=frame["value"].round(PLACES)))  # a reward of 1e-90 is nought
@@ -233,17 +261,41 @@ def _wide(
         numbers = found[found["case"] == case].set_index(["stage", "metric"])
         for name, label in (names or LABELS).items():
             if name in set(frame["controller"]):
-                cells = {metric: spread(numbers.reindex([(name, metric)]).iloc[0], decimals=decimals) for metric in order}
-                shown = {header.format(kind((words or {}).get(metric, metric))): cell for metric, cell in cells.items()}
+                shown = {}
+                for metric in order:
+                    places = decimals[metric] if isinstance(decimals, Mapping) else decimals
+                    cell = _cell(numbers.reindex([(name, metric)]).iloc[0], places)
+                    shown[header.format(kind((words or {}).get(metric, metric)))] = cell
                 rows.append({"case": ROMAN[case - 1], "controller": label} | shown)
     return pd.DataFrame(rows)
 
 
-def _figure_header(metric: str) -> str:
-    """A figure of control quality in words, with its variable and unit."""
-    figure, _, variable = metric.partition(":")
-    words, bracket, unit = FIGURES.get(figure, figure).partition(" (")
-    return f"{words}, {symbol(variable)}{bracket}{unit}"
+def _cell(numbers: pd.Series, decimals: int | None) -> str:
+    """A median with its interval; a dash for what was never reached, in most seeds or at the upper end."""
+    if numbers["median"] > NEVER / 4:  # half of it where one of the two seeds in the middle came there
+        return NOT_KNOWN
+    if numbers["ci_high"] > NEVER / 4:
+        return f"{numbers['median']:.{decimals}f} [{numbers['ci_low']:.{decimals}f}, {NOT_KNOWN}]"
+    return spread(numbers, decimals=decimals)
+
+
+def _quality(quality: pd.DataFrame, figures: Mapping[str, tuple[str, int, int]]) -> pd.DataFrame:
+    """Some figures of control quality, a column for each figure and variable; what a seed never reached counts as long.
+
+    Args:
+        quality: columns case, seed, controller, metric (figure:variable), value.
+        figures: header with its unit, factor and digits after the point by figure.
+    """
+    parts = quality["metric"].str.partition(":")
+    rows = quality.assign(figure=parts[0], variable=parts[2])[parts[0].isin(figures)]
+    factors = [figures[figure][1] for figure in rows["figure"]]
+    rows["value"] = (rows["value"] * factors).fillna(NEVER)
+    headers, decimals = {}, {}
+    for row in rows.drop_duplicates("metric").itertuples():
+        header, _, decimals[row.metric] = figures[row.figure]
+        words, bracket, unit = header.partition(" (")
+        headers[row.metric] = f"{words}, {symbol(row.variable)}{bracket}{unit}"
+    return _wide(rows, str, "{}", headers, decimals=decimals)
 
 
 def _labelled(table: pd.DataFrame) -> pd.DataFrame:

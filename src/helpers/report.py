@@ -212,6 +212,7 @@ def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapp
     environment.filters["numeral"] = lambda case: tables.ROMAN[case - 1]
     environment.filters["table"] = tables.to_markdown
     environment.filters["claims_table"] = tables.claims_table
+    environment.filters["stacked"] = stacked
     numbers = results.medians.set_index(scorecard.KEYS)[["median", "ci_low", "ci_high"]]
 
     def number(case: int, stage: str, metric: str, factor: float = 1, **style: Any) -> str:
@@ -233,6 +234,7 @@ def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapp
         claims=scorecard.verdicts_of_claims(results.claims),
         answers=limits_report.answers(results),
         standings=limits_report.standings(results),
+        improved_there=limits_report.improved_there(results),
         listing=partial(scorecard.listing, tabulated["comparison"]),
         better=_better(results),
         nearer=scorecard.nearer_to_expert(tabulated["comparison"]),
@@ -245,6 +247,11 @@ def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapp
         trajectories=scorecard.PUBLISHED_TRAJECTORIES,
         widest=scorecard.WIDEST,
     )
+
+
+def stacked(table: str) -> str:
+    """A Markdown table in which an interval is not broken, so that in narrow columns it stands below its median."""
+    return re.sub(r"\[(\S+), (\S+)\]", "[\\1,\N{NO-BREAK SPACE}\\2]", table)
 
 
 def _settings(parameters: pd.DataFrame, status: str, part: int) -> str:

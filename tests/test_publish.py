@@ -49,7 +49,10 @@ def test_other_runs_are_refused_in_one_sentence(changes, reference, revision, sa
 
 # The command ---------------------------------------------------------------------------------------------------------
 
-README = "# Title\n<!-- glance: a -->\nold\n<!-- /glance -->\nmiddle\n<!-- time: b -->\n<!-- /time -->\nend\n"
+README = (
+    "# Title\n<!-- glance: a -->\nold\n<!-- /glance -->\nmiddle\n"
+    "<!-- limits: c -->\n<!-- /limits -->\n<!-- time: b -->\n<!-- /time -->\nend\n"
+)
 
 
 GAPS = """\
@@ -118,7 +121,19 @@ def test_publishing_writes_the_numbers_into_readme(project):
     assert "(ours: medians and 95 % bootstrap intervals of the median over 20 seeds)" in lines
     assert any("offline_improved" in line and " 20 " in line for line in lines)
     kept = [line for line in lines if line in README.splitlines()]
-    assert kept == ["# Title", "<!-- glance: a -->", "<!-- /glance -->", "middle", "<!-- time: b -->", "<!-- /time -->", "end"]
+    assert kept == README.replace("old\n", "").splitlines()
+
+
+def test_the_gaps_to_the_optimum_of_the_sharpest_objective_are_written_where_they_were_run(project):
+    columns = 'controller,"I, $\\beta$ = 10","I, $\\beta$ = 30","III, $\\beta$ = 10","III, $\\beta$ = 30"'
+    rows = ["PID (demonstrator),1.0,2.0,3.0,4.5", 'offset-free MPC,5.0,"6.0 [5.0, 7.0]",7.0,8.0', "programme on x,0.0,0.0,0.0,0.0"]
+    (project / "reports/latest/tables/limits_gaps.csv").write_text("\n".join([columns, *rows, ""]))
+    assert publish.main() == 0
+    lines = (project / "README.md").read_text(encoding="utf-8").splitlines()
+    first = lines.index("<!-- limits: c -->") + 1
+    table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[first : lines.index("<!-- /limits -->")]]
+    assert table[0] == ["controller", "case I, %", "case III, %"]
+    assert table[2:] == [["PID (demonstrator)", "2.0", "4.5"], ["offset-free MPC", "6.0 [5.0, 7.0]", "8.0"]]
 
 
 @pytest.fixture
@@ -180,7 +195,7 @@ def test_a_report_without_the_evidence_of_the_published_one_does_not_replace_it(
     before = content()
     assert f"the run lacks tables/{table}, which the published one has" in refused(capsys, 2)
     assert content() == before
-    (project / "reports/latest/tables" / table).touch()
+    (project / "reports/latest/tables" / table).write_text('controller,"I, $\\beta$ = 30"\n')
     assert publish.main() == 0
 
 

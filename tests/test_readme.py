@@ -55,6 +55,15 @@ def test_the_times_are_those_of_the_reference_run():
         assert re.findall(r"\b\d+\b", rows[stage].replace(stage, "")) == [f"{seconds:.0f}" for seconds in times]
 
 
+@published
+def test_the_gaps_to_the_optimum_are_those_of_the_reference_run():
+    every = pd.read_csv(REFERENCE / "tables/limits_gaps.csv").set_index("controller")
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in block("limits").splitlines()[2:]]
+    assert len(rows) == 10
+    for controller, *cells in rows:
+        assert cells == every.loc[controller].filter(like="= 30").tolist()
+
+
 @pytest.mark.parametrize("link", [link for link in LINKS if "://" not in link])
 def test_links_lead_to_files(link):
     if link.startswith("reports/reference") and not REFERENCE.is_dir():

@@ -10,10 +10,13 @@ from typing import Any
 import pandas as pd
 
 from helpers.artifacts import code_revision
+from helpers.limits_figures import LABELS, LEARNERS
 from helpers.sources import PROJECT
 from helpers.tables import ROMAN, spread
 
 LATEST, REFERENCE, RESULTS = PROJECT / "reports/latest", PROJECT / "reports/reference", PROJECT / "results"
+LIMITS = "tables/limits_gaps.csv"
+SHOWN = ("expert", "online", *LEARNERS, "mpc", "minimum_variance")  # controllers, of README's gaps to the optimum
 PARTS = ("report.html", "figures", "tables", "comparison.csv", "seeds.csv", "provenance.json")
 
 
@@ -81,6 +84,15 @@ def time_by_stage(time: pd.DataFrame) -> str:
     return f"Seconds inside each stage's notebook, medians over seeds, two stages at a time:\n\n{cells.to_markdown(index=False)}"
 
 
+def limits_at_a_glance(gaps: pd.DataFrame) -> str:
+    """README's gaps to the optimum, as Markdown, from tables/limits_gaps.csv: those under the greatest beta."""
+    columns = pd.DataFrame([name.split(", $\\beta$ = ") for name in gaps.columns[1:]], columns=["case", "beta"])
+    sharpest = columns["beta"].astype(float).max()
+    chosen = {f"{case}, $\\beta$ = {sharpest:g}": f"case {case}, %" for case in columns["case"].unique()}
+    shown = gaps[gaps["controller"].isin([LABELS[name] for name in SHOWN])][["controller", *chosen]].rename(columns=chosen)
+    return str(shown.to_markdown(index=False, disable_numparse=True))
+
+
 def fill(text: str, block: str, content: str) -> str:
     """The text with `content` between the marks of a block."""
     head, found, rest = text.partition(f"<!-- {block}:")
@@ -99,8 +111,7 @@ def check_copies(copies: Iterable[Path]) -> None:
 
 def check_tables(latest: Path, reference: Path) -> None:
     """Refuse a report without the claims or the limits that the published one has."""
-    tables = [f"tables/{name}.csv" for name in ("claims", "limits_gaps")]
-    if missing := [name for name in tables if (reference / name).exists() and not (latest / name).exists()]:
+    if missing := [name for name in ("tables/claims.csv", LIMITS) if (reference / name).exists() and not (latest / name).exists()]:
         raise PublishError(f"{latest}: the run lacks {' and '.join(missing)}, which the published one has; run make evidence")
 
 
@@ -131,6 +142,8 @@ def publish() -> None:
     check_copies(copies.values())
     readme = PROJECT / "README.md"
     text = fill(readme.read_text(encoding="utf-8"), "glance", glance(pd.read_csv(LATEST / "tables/gaps.csv")))
+    if (LATEST / LIMITS).exists():
+        text = fill(text, "limits", limits_at_a_glance(pd.read_csv(LATEST / LIMITS)))
     text = fill(text, "time", time_by_stage(pd.read_csv(LATEST / "tables/time.csv")))
     partial, old = _beside("partial"), _beside("old")
     for part in PARTS:

@@ -59,9 +59,29 @@ def test_the_times_are_those_of_the_reference_run():
 def test_the_gaps_to_the_optimum_are_those_of_the_reference_run():
     every = pd.read_csv(REFERENCE / "tables/limits_gaps.csv").set_index("controller")
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in block("limits").splitlines()[2:]]
-    assert len(rows) == 10
+    assert len(rows) == 11
     for controller, *cells in rows:
         assert cells == every.loc[controller].filter(like="= 30").tolist()
+
+
+@published
+def test_what_follows_from_the_limits_is_what_the_reference_run_shows():
+    """Minimum variance ahead of all learners; improving elsewhere ahead of it, mostly of MPC too; only MPC never below the PID."""
+
+    def medians(name, index):
+        table = pd.read_csv(REFERENCE / f"tables/limits_{name}.csv").set_index(index)
+        return table.map(lambda cell: float(str(cell).split(" ")[0]))
+
+    gaps = medians("gaps", "controller").filter(like="= 30")
+    learners = gaps.loc[[name for name in gaps.index if "REINFORCE" in name or "PPO" in name or name == "PID, tuned"]]
+    assert len(learners) == 6
+    assert (learners > gaps.loc["minimum variance on y"]).all(axis=None)
+    there = medians("improved", ["controller", "case"])
+    ahead = {name: there.loc["improved on that plant"] > there.loc[name] for name in ("minimum variance on y", "offset-free MPC")}
+    assert ahead["minimum variance on y"].all(axis=None)
+    assert ahead["offset-free MPC"].sum(axis=None) > 3  # of six
+    kept = medians("robustness", ["controller", "case"]).groupby("controller").min().min(axis=1).drop("PID (demonstrator)")
+    assert kept[kept >= 100].index.tolist() == ["offset-free MPC"]
 
 
 @pytest.mark.parametrize("link", [link for link in LINKS if "://" not in link])

@@ -2,14 +2,15 @@
 
 from collections.abc import Callable, Mapping
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from scipy.optimize import lsq_linear
 
 from helpers import scorecard
 from helpers.collection import Results
-from helpers.limits_answer import NO_LEARNERS, WITH_MODEL, answer
-from helpers.limits_figures import LABELS, budget_curves, gap_figure, heat_maps
-from helpers.statistics import FEWEST, median_interval
+from helpers.limits_figures import GRIDS, LABELS, budget_curves, gap_figure, heat_maps
+from helpers.params import Params
 from helpers.tables import NOT_KNOWN, ROMAN, spread, symbol
 
 PLACES = 4  # digits after the point that count
@@ -67,102 +68,116 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     if gaps.empty:
         return {}
     budget = read(results, "budget", "curves.csv").rename(columns={"learner": "controller", "objective": "value"})
-    listed = _listed(results)
-    there = read(results, "robustness", "improved.csv")
-    plants = [f"A x {state:g}, B x {entry:g}" for state, entry in zip(there["state"], there["input"], strict=True)]
-    there = there.assign(metric=plants).rename(columns={"objective": "value"})
+    listed = listed_budgets(results)
+    there = on_mismatch(results).rename(columns={"plant": "metric", "objective": "value"})
     quality = read(results, "quality", "quality.csv").rename(columns={"figure": "metric"})
     safety = read(results, "safety", "safety.csv").melt(["case", "seed", "run"], var_name="metric")
     return {
         "limits_gaps": _gaps(gaps),
-        "limits_budget": _wide(listed.rename(columns={"learner": "controller"}), int, "J after {:,}", decimals=2),
-        "limits_pairs": _wide(_ahead(listed), int, "after {:,}", decimals=2).rename(columns={"controller": "rival"}),
-        "limits_robustness": _wide(_worst(results).rename(columns={"group": "metric"}), str, "{}", GROUPS, decimals=0),
+        "limits_attainable": _attainable(gaps),
+        "limits_budget": _budget(listed),
+        "limits_pairs": _wide(ahead(listed), int, "after {:,}", decimals=2).rename(columns={"controller": "rival"}),
+        "limits_robustness": _wide(worst(results).rename(columns={"group": "metric"}), str, "{}", GROUPS, decimals=0),
         "limits_improved": _wide(there, str, "{}", decimals=1),
         **{f"limits_{table}": _quality(quality, figures) for table, figures in QUALITY.items()},
         "limits_safety": _wide(safety.rename(columns={"run": "controller"}), str, "{}", SAFETY, RUNS),
     } | ({"limits_curves": budget} if len(budget) else {})
 
 
-def _worst(results: Results) -> pd.DataFrame:
-    """The least share of the PID's objective over each grid of conditions: case, seed, controller, group, value (per cent)."""
+def unholdable(results: Results) -> pd.DataFrame:
+    """The conditions under which no input within the bounds holds the set point: columns case, group, row, column."""
     robust = read(results, "robustness", "robustness.csv")
-    expert = robust[robust["controller"] == "expert"].drop(columns=["controller", "standard_error"])
-    paired = robust.merge(expert, on=["case", "seed", "group", "row", "column"], suffixes=("", "_expert"))
+    places = robust[robust["group"].isin(["model", "set_point"])][["case", "group", "row", "column"]].drop_duplicates()
+    found = [not _holdable(results.params[case], *place) for case, *place in places.itertuples(index=False)]
+    return places[np.array(found, dtype=bool)]
+
+
+def _holdable(params: Params, group: str, row: str, column: str) -> bool:
+    """Whether A x + B u = 0 (Eq. 4.1.3b) has a solution within the bounds at the set point of a condition."""
+    process, target = params.process, np.array(params.case.set_point)
+    state, entry = (float(row), float(column)) if group == "model" else (1.0, 1.0)
+    factors = np.array([float(row), *[float(column)] * (len(target) - 1)]) if group == "set_point" else 1.0
+    needed = -state * np.array(process.drift_state) @ (factors * target)
+    found = lsq_linear(entry * np.array(process.drift_input), needed, (process.input_low, process.input_high))
+    return bool(np.linalg.norm(found.fun) <= 1e-6 * np.linalg.norm(needed))
+
+
+def worst(results: Results) -> pd.DataFrame:
+    """The least share of the PID's objective over each grid of conditions: case, seed, controller, group, value (per cent).
+
+    Conditions under which no input within the bounds holds the set point are left out.
+    """
+    place = ["group", "row", "column"]
+    robust = read(results, "robustness", "robustness.csv")
+    kept = robust.merge(unholdable(results), how="left", indicator=True).query("_merge == 'left_only'").drop(columns="_merge")
+    expert = kept[kept["controller"] == "expert"].drop(columns=["controller", "standard_error"])
+    paired = kept.merge(expert, on=["case", "seed", *place], suffixes=("", "_expert"))
     shares = paired.assign(value=100 * paired["objective"] / paired["objective_expert"])
     return shares.groupby(["case", "seed", "controller", "group"], as_index=False)["value"].min()
 
 
-def ranges(results: Results) -> str:
-    """What the grids of conditions span, in words; empty where notebook 06 was not run."""
-    robust = read(results, "robustness", "robustness.csv")
-    if robust.empty:
-        return ""
-    words = {
-        "model": "A and B times {} and {}",
-        "noise": "disturbance times {} and observation noise times {}",
-        "set_point": "the set points of the two loops times {} and {}",
-        "time": "dead time of {} samples and a load step of {} of the set point change per sample",
-    }
-    spans = robust.astype({"row": float, "column": float}).groupby("group")[["row", "column"]].agg(["min", "max"])
-    found = []
-    for group, text in words.items():
-        if group in spans.index:
-            ends = spans.loc[group]
-            found.append(text.format(*(f"{ends[axis, 'min']:g} to {ends[axis, 'max']:g}" for axis in ("row", "column"))))
-    return "; ".join(found)
+def on_mismatch(results: Results) -> pd.DataFrame:
+    """The objective on the plants that online improvement started on: columns case, seed, plant, controller, objective.
 
-
-def price(results: Results) -> dict[int, dict[str, float]]:
-    """What online improvement costs in each case, in per cent and medians over seeds; empty where notebook 06 was not run.
-
-    worse: the exploring episodes that were worse than the PID; set_point and model: the least share of the PID's objective that
-    the improved policy keeps at set points not trained on and on plants that are not the model.
-    """
-    safety = read(results, "safety", "safety.csv")
-    if safety.empty:
-        return {}
-    worse = 100 * safety[safety["run"] == "hot"].groupby("case")["worse"].median()
-    online = _worst(results).query("controller == 'online'")
-    worst = online.pivot_table(index="case", columns="group", values="value", aggfunc="median")
-    return worst.reindex(columns=["set_point", "model"]).assign(worse=worse).to_dict("index")
-
-
-def improved_there(results: Results) -> dict[str, list[int]]:
-    """By mismatched plant: the cases in which improving there ends ahead of minimum variance with the wrong model.
-
-    By the whole interval of the difference within seeds; empty where notebook 06 was not run or for too few seeds.
+    The controllers that were not measured beside it are those of the grid, on draws of their own.
     """
     there = read(results, "robustness", "improved.csv")
-    if there.empty or there["seed"].nunique() < FEWEST:
-        return {}
-    found: dict[str, list[int]] = {}
-    for (state, entry, case), rows in there.groupby(["state", "input", "case"], sort=False):
-        reached = rows.pivot_table(index="seed", columns="controller", values="objective")
-        cases = found.setdefault(f"A x {state:g}, B x {entry:g}", [])
-        if _low(reached["online_there"] - reached["minimum_variance"]) > 0:
-            cases.append(int(case))
-    return found
+    robust = read(results, "robustness", "robustness.csv")
+    grid = robust[robust["group"] == "model"].astype({"row": float, "column": float})
+    grid = grid.rename(columns={"row": "state", "column": "input"}).merge(there[["state", "input"]].drop_duplicates())
+    every = pd.concat([there, grid[~grid["controller"].isin(there["controller"])]], ignore_index=True)
+    plants = [f"A x {state:g}, B x {entry:g}" for state, entry in zip(every["state"], every["input"], strict=True)]
+    return every.assign(plant=plants)[["case", "seed", "plant", "controller", "objective"]]
 
 
-def _summary(frame: pd.DataFrame) -> pd.DataFrame:
+def summary(frame: pd.DataFrame) -> pd.DataFrame:
+    """Medians over seeds, `scorecard.summary`, of rows with columns case, seed, controller, metric and value."""
     return scorecard.summary(frame.rename(columns={"controller": "stage"})[["case", "seed", "stage", "metric", "value"]])
 
 
 def _gaps(gaps: pd.DataFrame) -> pd.DataFrame:
     """A row for each controller, a column for each case and beta: the gap to the programme in per cent."""
     columns: dict[str, dict[str, str]] = {}
-    for (case, beta), rows in gaps.groupby(["case", "beta"]):
+    for (case, beta), rows in _with_interval(gaps, "gap", ("gap_low", "gap_high")).groupby(["case", "beta"]):
+        found = rows.set_index("controller")
         column = f"{ROMAN[case - 1]}, $\\beta$ = {beta:g}"
-        if len(set(rows["seed"])) == 1:
-            found = rows.rename(columns={"gap": "median", "gap_low": "ci_low", "gap_high": "ci_high"}).set_index("controller")
-        else:
-            found = _summary(rows.assign(metric="gap", value=rows["gap"])).set_index("stage")
         columns[column] = {name: spread(found.loc[name], decimals=1) for name in LABELS if name in found.index}
     return _labelled(pd.DataFrame(columns))
 
 
-def _ahead(listed: pd.DataFrame) -> pd.DataFrame:
+def _attainable(gaps: pd.DataFrame) -> pd.DataFrame:
+    """The objective of the controllers that know the process: a row for each case and controller, a column for each beta."""
+    known = [name for name in LABELS if name.startswith(("minimum_variance", "dynamic_programme"))]
+    found = _with_interval(gaps, "objective", ("low", "high")).set_index(["case", "controller", "beta"])
+    rows = []
+    for case in sorted(gaps["case"].unique()):
+        for name in known:
+            places = {beta: (case, name, beta) for beta in sorted(gaps["beta"].unique()) if (case, name, beta) in found.index}
+            cells = {f"$J$, $\\beta$ = {beta:g}": spread(found.loc[place], decimals=2) for beta, place in places.items()}
+            rows.append({"case": ROMAN[case - 1], "controller": LABELS[name]} | cells)
+    return pd.DataFrame(rows)
+
+
+def _with_interval(gaps: pd.DataFrame, name: str, ends: tuple[str, str]) -> pd.DataFrame:
+    """Columns case, beta, controller, median, ci_low, ci_high of one quantity; of a single seed that of its Monte Carlo."""
+    if len(set(gaps["seed"])) == 1:
+        return gaps.rename(columns={name: "median", ends[0]: "ci_low", ends[1]: "ci_high"})
+    found = [summary(rows.assign(metric=name, value=rows[name])).assign(beta=beta) for beta, rows in gaps.groupby("beta")]
+    return pd.concat(found, ignore_index=True).rename(columns={"stage": "controller"})
+
+
+def _budget(listed: pd.DataFrame) -> pd.DataFrame:
+    """The objective at the listed budgets, and its range over the seeds at the last of them."""
+    table = _wide(listed.rename(columns={"learner": "controller"}), int, "J after {:,}", decimals=2)
+    if len(set(listed["seed"])) == 1:
+        return table
+    last = listed[listed["metric"] == listed["metric"].iloc[-1]].groupby(["case", "learner"])["value"].agg(["min", "max"])
+    spans = {(ROMAN[case - 1], LABELS[name]): f"{low:.2f} to {high:.2f}" for (case, name), (low, high) in last.T.items()}
+    places = table[["case", "controller"]].itertuples(index=False, name=None)
+    return table.assign(**{"least to greatest at the end": [spans[place] for place in places]})
+
+
+def ahead(listed: pd.DataFrame) -> pd.DataFrame:
     """How far the paper's learner is ahead of each rival within a seed: columns case, seed, metric (the budget), controller, value.
 
     Args:
@@ -173,77 +188,10 @@ def _ahead(listed: pd.DataFrame) -> pd.DataFrame:
     return wide[rivals].rsub(wide.get(THE_PAPERS), axis=0).melt(ignore_index=False, var_name="controller").reset_index().dropna()
 
 
-def standings(results: Results) -> dict[int, dict[str, dict[str, list[int]]]]:
-    """By budget and rival: the cases in which the paper's learner is ahead of it, behind it, or where the seeds cannot tell.
-
-    Cases with too few seeds for an interval are left out.
-    """
-    listed = _listed(results)
-    ahead = _ahead(listed) if len(listed) else listed
-    found: dict[int, dict[str, dict[str, list[int]]]] = {}
-    for row in _summary(ahead).dropna(subset="ci_low").itertuples() if len(ahead) else ():
-        word = "ahead" if row.ci_low > 0 else "behind" if row.ci_high < 0 else "not to be told apart"
-        found.setdefault(row.metric, {}).setdefault(row.stage, {}).setdefault(word, []).append(row.case)
-    return dict(sorted(found.items()))
-
-
-def _listed(results: Results) -> pd.DataFrame:
+def listed_budgets(results: Results) -> pd.DataFrame:
+    """The objective at the listed budgets: columns case, seed, learner, metric (the budget), value."""
     budget = read(results, "budget", "budget.csv")
     return budget.melt(["case", "seed", "learner"], var_name="metric") if len(budget) else budget
-
-
-def answers(results: Results) -> dict[int, str]:
-    """What a practitioner can read off, a sentence or two for each case that notebook 06 was run for.
-
-    Off the medians; with as many seeds as make an interval, learners are compared within seeds, and those that cannot be told
-    apart from the best are named.
-    """
-    gaps, budget = read(results, "attainable", "gaps.csv"), read(results, "budget", "budget.csv")
-    found = {}
-    for case in sorted(gaps["case"].unique()) if len(gaps) else ():
-        headline = results.params[case].case.online.headline_beta
-        own = gaps[(gaps["case"] == case) & (gaps["beta"] == headline)]
-        listed = budget[budget["case"] == case].drop(columns="case").set_index(["seed", "learner"]).rename(columns=int)
-        listed = listed[[episodes for episodes in listed if episodes]]  # nobody has learned from none
-        if own["seed"].nunique() < FEWEST:
-            medians = listed.groupby("learner", sort=False).median()
-            found[int(case)] = answer(own.groupby("controller")[["objective", "gap"]].median(), medians)
-        else:
-            found[int(case)] = _answer_over_seeds(own, listed)
-    return found
-
-
-def _answer_over_seeds(own: pd.DataFrame, listed: pd.DataFrame) -> str:
-    """Who learns best, who cannot be told apart from it, and who passes the controllers that have the exact model instead.
-
-    Args:
-        own: columns seed, controller, objective, gap, of one case and beta.
-        listed: the objective after so many episodes (columns), index seed and learner.
-    """
-    reached = own.pivot_table(index="seed", columns="controller", values="objective")
-    best, passing = [], []
-    for episodes in listed:
-        learners = listed.pivot_table(index="seed", columns="learner", values=episodes)
-        learners = learners.drop(columns=list(NO_LEARNERS), errors="ignore")
-        first = learners.median().idxmax()
-        ahead = {name: _low(learners[first] - learners[name]) for name in learners if name != first}
-        tied = ", ".join(LABELS[name] for name, low in ahead.items() if low <= 0)
-        apart = f"not to be told apart from {tied}" if tied else "ahead of all others"
-        best.append(f"after {episodes:,} episodes {LABELS[first]}, $J$ = {learners[first].median():.1f} ({apart})")
-        passed = [LABELS[name] for name in learners if _low(learners[name] - reached["mpc"]) > 0]
-        passing.append(f"after {episodes:,} {', '.join(passed) or 'none'}")
-    medians = own.groupby("controller")[["objective", "gap"]].median()
-    known = ", ".join(f"{LABELS[name]} {medians['objective'][name]:.1f} ({medians['gap'][name]:.1f} %)" for name in WITH_MODEL)
-    return (
-        f"**Learning on the plant**, best in the median: {'; '.join(best)}. **With the exact model** and no episode at all (in "
-        f"brackets the gap to the programme): {known}; the demonstrator stands {medians['gap']['expert']:.1f} % below it. "
-        f"Learners ahead of offset-free MPC in the same seeds, by the whole interval: {'; '.join(passing)}."
-    )
-
-
-def _low(differences: pd.Series) -> float:
-    """The lower end of the interval of the median difference."""
-    return float(median_interval(differences.dropna().to_numpy())[0])
 
 
 def _wide(
@@ -255,7 +203,7 @@ def _wide(
     decimals: int | Mapping[str, int] | None = None,
 ) -> pd.DataFrame:
     """Medians of long rows (case, seed, controller, metric, value): a row for each case and controller, a column a metric."""
-    found = _summary(frame.assign(value=frame["value"].round(PLACES)))  # a reward of 1e-90 is nought
+    found = summary(frame.assign(value=frame["value"].round(PLACES)))  # a reward of 1e-90 is nought
     order, rows = list(dict.fromkeys(frame["metric"])), []
     for case in sorted(frame["case"].unique()):
         numbers = found[found["case"] == case].set_index(["stage", "metric"])
@@ -289,7 +237,11 @@ def _quality(quality: pd.DataFrame, figures: Mapping[str, tuple[str, int, int]])
     parts = quality["metric"].str.partition(":")
     rows = quality.assign(figure=parts[0], variable=parts[2])[parts[0].isin(figures)]
     factors = [figures[figure][1] for figure in rows["figure"]]
-    rows["value"] = (rows["value"] * factors).fillna(NEVER)
+    place = ["case", "seed", "controller", "variable"]
+    rises = quality.assign(variable=parts[2])[(parts[0] == "rise_time") & quality["value"].notna()]
+    arrived = pd.MultiIndex.from_frame(rows[place]).isin(pd.MultiIndex.from_frame(rises[place]))
+    overshoots = (rows["figure"] == "overshoot") & ~arrived  # what never comes near the set point overshoots by no number
+    rows["value"] = (rows["value"] * factors).mask(overshoots).fillna(NEVER)
     headers, decimals = {}, {}
     for row in rows.drop_duplicates("metric").itertuples():
         header, _, decimals[row.metric] = figures[row.figure]
@@ -309,10 +261,16 @@ def draw(results: Results) -> dict[str, Figure]:
     robust, place = read(results, "robustness", "robustness.csv"), ["group", "row", "column", "controller"]
     drawn = {}
     for case in sorted(gaps["case"].unique()) if len(gaps) else ():
-        own = gaps[gaps["case"] == case].groupby(["beta", "controller"], as_index=False).median(numeric_only=True)
-        levels = own[own["beta"] == results.params[case].case.online.headline_beta].set_index("controller")["objective"]
-        drawn[f"limits_budget_case_{case}"] = budget_curves(curves[curves["case"] == case], levels)
-        drawn[f"limits_gaps_case_{case}"] = gap_figure(own)
+        own = gaps[gaps["case"] == case]
+        sharp = own[own["beta"] == results.params[case].case.online.headline_beta]
+        drawn[f"limits_budget_case_{case}"] = budget_curves(
+            curves[curves["case"] == case], sharp.groupby("controller")["objective"].median()
+        )
+        shown = _with_interval(own, "gap", ("gap_low", "gap_high"))
+        shown = shown.rename(columns={"median": "gap", "ci_low": "gap_low", "ci_high": "gap_high"})
+        drawn[f"limits_gaps_case_{case}"] = gap_figure(shown)
         cells = robust[robust["case"] == case].groupby(place, as_index=False, sort=False)["objective"].median()
-        drawn[f"limits_model_case_{case}"] = heat_maps(cells, "model", list(cells["controller"].unique()))
+        for group in GRIDS if len(cells) else ():
+            if group in set(cells["group"]):
+                drawn[f"limits_{group}_case_{case}"] = heat_maps(cells, group, list(cells["controller"].unique()))
     return drawn

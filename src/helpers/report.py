@@ -18,7 +18,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 from PIL import Image
 
-from helpers import drawings, figures, limits_report, scorecard, statistics, tables
+from helpers import drawings, figures, limits_findings, limits_report, scorecard, statistics, tables
 from helpers.artifacts import ArtifactError, code_revision
 from helpers.collection import ONLINE, Results
 from helpers.identity import digest, versions
@@ -232,15 +232,11 @@ def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapp
         published=results.published,
         benchmarks=benchmarks,
         claims=scorecard.verdicts_of_claims(results.claims),
-        answers=limits_report.answers(results),
-        standings=limits_report.standings(results),
-        improved_there=limits_report.improved_there(results),
+        limits=limits_findings.find(results),
         listing=partial(scorecard.listing, tabulated["comparison"]),
         better=_better(results),
         nearer=scorecard.nearer_to_expert(tabulated["comparison"]),
         outside=scorecard.outside(tabulated["comparison"]),
-        price=limits_report.price(results),
-        ranges=limits_report.ranges(results),
         settings=partial(_settings, tabulated["parameters"]),
         level=statistics.LEVEL,
         fewest=statistics.FEWEST,

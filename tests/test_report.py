@@ -299,6 +299,15 @@ def test_several_seeds_are_compared_by_median_and_intervals(several):
     assert row[["pred_low", "pred_high"]].tolist() == pytest.approx([middle - reach, middle + reach], rel=1e-6)
 
 
+def test_what_went_well_is_said_where_the_limits_were_not_run(results, monkeypatch):
+    """The smoke run reaches nothing, so the words for better results are asked for."""
+    monkeypatch.setattr(report, "_better", lambda _: {"gap": [1, 2], "worse_as_printed": [2], "online": [1]})
+    text = report.render(results, report.tabulate(results), report.provenance(results))
+    assert "in Case Studies I and II the learned policy lies nearer" in text
+    assert "in Case Study I online learning lifts the objective above the PID's.\n" in text
+    assert "It has its price" not in text
+
+
 def test_claims_trials_and_budget_appear_where_they_were_run(several):
     before = collect(several)
     trial = next(iter(before.params[1].trials))

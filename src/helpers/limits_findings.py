@@ -67,11 +67,9 @@ def answers(results: Results) -> dict[int, str]:
     Off the medians; with as many seeds as make an interval, learners are compared within seeds, and those that cannot be told
     apart from the best are named.
     """
-    gaps, budget = read(results, "attainable", "gaps.csv"), read(results, "budget", "budget.csv")
+    gaps, budget = _sharp(results), read(results, "budget", "budget.csv")
     found = {}
-    for case in sorted(gaps["case"].unique()) if len(gaps) else ():
-        headline = results.params[case].case.online.headline_beta
-        own = gaps[(gaps["case"] == case) & (gaps["beta"] == headline)]
+    for case, own in gaps.groupby("case"):
         listed = budget[budget["case"] == case].drop(columns="case").set_index(["seed", "learner"]).rename(columns=int)
         listed = listed[[episodes for episodes in listed if episodes]]  # nobody has learned from none
         if own["seed"].nunique() < FEWEST:
@@ -87,10 +85,8 @@ def standings(results: Results) -> dict[int, dict[str, dict[str, list[int]]]]:
 
     Cases with too few seeds for an interval are left out.
     """
-    listed = listed_budgets(results)
-    differences = ahead(listed) if len(listed) else listed
     found: dict[int, dict[str, dict[str, list[int]]]] = {}
-    for row in summary(differences).dropna(subset="ci_low").itertuples() if len(differences) else ():
+    for row in summary(ahead(listed_budgets(results))).dropna(subset="ci_low").itertuples():
         word = "ahead" if row.ci_low > 0 else "behind" if row.ci_high < 0 else "not to be told apart"
         found.setdefault(row.metric, {}).setdefault(row.stage, {}).setdefault(word, []).append(row.case)
     return dict(sorted(found.items()))
@@ -155,10 +151,8 @@ def not_found(results: Results) -> dict[int, list[str]]:
 
 
 def ranges(results: Results) -> str:
-    """What the grids of conditions span, in words; empty where notebook 06 was not run."""
+    """What the grids of conditions span, in words."""
     robust = read(results, "robustness", "robustness.csv")
-    if robust.empty:
-        return ""
     words = {
         "model": "A and B times {} and {}",
         "noise": "disturbance times {} and observation noise times {}",
@@ -216,14 +210,12 @@ def there(results: Results) -> dict[str, dict[int, list[str]]]:
 
 
 def price(results: Results) -> dict[int, dict[str, float]]:
-    """What online improvement costs in each case, in per cent and medians over seeds; empty where notebook 06 was not run.
+    """What online improvement costs in each case, in per cent and medians over seeds.
 
     worse: the exploring episodes that were worse than the PID; set_point and model: the least share of the PID's objective that
     the improved policy reaches at set points not trained on and on plants that are not the model, where the bounds allow it.
     """
     safety = read(results, "safety", "safety.csv")
-    if safety.empty:
-        return {}
     worse = 100 * safety[safety["run"] == "hot"].groupby("case")["worse"].median()
     online = worst(results).query("controller == 'online'")
     kept = online.pivot_table(index="case", columns="group", values="value", aggfunc="median")

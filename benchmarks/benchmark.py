@@ -24,6 +24,7 @@ from benchmarks.subjects import (
     scaling,
     scaling_sizes,
 )
+from helpers.artifacts import code_revision
 
 FLOATS = "%.6g"
 ENOUGH_SECONDS = 75.0  # no further round begins after that long, on a machine that is slow or busy
@@ -92,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     given = parser.parse_args(arguments)
     size = QUICK if given.quick else FULL
-    load = {"at the start": outcome.load_average()}
+    load, revision = {"at the start": outcome.load_average()}, code_revision(PROJECT)  # before what is written here changes it
     workload = Workload.of()
     if not library_installed():
         say("stable-baselines3 and sb3-contrib are not installed (the extra 'bench'): RecurrentPPO is left out")
@@ -126,7 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     plt.close(figure)
     text = outcome.summary(compared, scaled, fits, stages, flops, load["at the start"])
     (given.out / "summary.md").write_text(text, encoding="utf-8")
-    settings = {"rounds": size.rounds, "number type": workload.dtype, "operations of a learnt step": flops}
+    settings = {"code": revision, "rounds": size.rounds, "number type": workload.dtype, "operations of a learnt step": flops}
     (given.out / "machine.md").write_text(outcome.machine(load, settings), encoding="utf-8")
     say(f"\n{text}\nwritten: {given.out}")
     return 0

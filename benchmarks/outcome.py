@@ -24,11 +24,9 @@ from benchmarks.subjects import (
     ONE_AT_A_TIME,
     OURS,
     PRODUCT,
-    PROJECT,
     SIDE_BY_SIDE,
     Subject,
 )
-from helpers.artifacts import code_revision
 from helpers.figures import INK, MUTED, WIDTH
 from helpers.identity import versions
 from helpers.tables import to_markdown
@@ -203,7 +201,6 @@ def machine(load: Mapping[str, tuple[float, ...]], settings: Mapping[str, object
             f"{when} {', '.join(f'{value:.2f}' for value in loads)}" for when, loads in load.items()
         ),
         "date": f"{datetime.now(UTC):%Y-%m-%d}",
-        "code": code_revision(PROJECT),
     }
     rows |= {key: str(value) for key, value in settings.items()} | known
     return to_markdown(pd.DataFrame({"what": rows.keys(), "value": rows.values()})) + "\n"

@@ -188,6 +188,7 @@ def written(tmp_path_factory):
     out = tmp_path_factory.mktemp("benchmarks")
     with pytest.MonkeyPatch.context() as patch:  # one process a size takes long; the next test starts one
         patch.setattr(benchmark, "peak_memory", lambda sizes: {(K, T): 0.1 * K * T for K, T in sizes})
+        patch.setattr(benchmark, "code_revision", lambda _: "abc+changes" if any(out.iterdir()) else "abc")
         assert benchmark.main(["--quick", "--out", str(out)]) == 0
     return out
 
@@ -229,6 +230,11 @@ def test_the_summary_begins_with_ratios_and_no_file_names_a_place(written):
         assert str(Path.home()) not in content
         assert str(subjects.PROJECT) not in content
         assert platform.node() not in content
+
+
+def test_what_a_run_writes_is_no_change_of_the_code_it_measured(written):
+    row = next(line for line in (written / "machine.md").read_text(encoding="utf-8").splitlines() if "code" in line.lower())
+    assert row.split("|")[2].strip() == "abc"
 
 
 def test_stages_are_read_from_the_records_of_the_run(tmp_path):

@@ -7,12 +7,22 @@ import pandas as pd
 from helpers.collection import Results
 from helpers.limits_answer import NO_LEARNERS, WITH_MODEL, answer
 from helpers.limits_figures import LABELS, LEARNERS
-from helpers.limits_report import ahead, listed_budgets, on_mismatch, read, summary, unholdable, worst
+from helpers.limits_report import (
+    RIVALS,
+    ahead,
+    listed_budgets,
+    on_mismatch,
+    plant_names,
+    read,
+    sharpest,
+    summary,
+    unholdable,
+    worst,
+)
 from helpers.statistics import FEWEST, median_interval
 from helpers.tables import symbol
 
 TUNED = 1.05  # of the objective it began with, for a search to have found other gains
-WITHOUT_MODEL = tuple(name for name in LEARNERS if name != "irl_reinforce")  # whose offline part needs one
 END_IN_REINFORCE = ("online", "irl_reinforce", "clone_reinforce", "scratch_reinforce")
 
 
@@ -49,10 +59,7 @@ def attainable(results: Results) -> dict[int, dict[str, float]]:
 
 
 def _sharp(results: Results) -> pd.DataFrame:
-    """The gaps under the headline beta of each case."""
-    gaps = read(results, "attainable", "gaps.csv")
-    sharpest = gaps["case"].map(lambda case: results.params[case].case.online.headline_beta)
-    return gaps[gaps["beta"] == sharpest]
+    return sharpest(results, read(results, "attainable", "gaps.csv"))
 
 
 def agreement(results: Results) -> float:
@@ -125,7 +132,7 @@ def practice(results: Results) -> dict[str, Any]:
     for (case, budget), row in medians.unstack("learner").iterrows():  # noqa: PD010
         if budget == max(listed["metric"]) and reached[case, "minimum_variance"] > row.reindex(LEARNERS).max():
             model_ahead.append(int(case))
-        if budget and (others := row.reindex(WITHOUT_MODEL).dropna()).size:
+        if budget and (others := row.reindex(RIVALS).dropna()).size:
             without_model.setdefault(int(budget), {}).setdefault(LABELS[others.idxmax()], []).append(int(case))
     shares = worst(results)
     kept = shares.pivot_table(index="controller", columns=["case", "group"], values="value", aggfunc="median").drop(index="expert")
@@ -172,10 +179,8 @@ def left_out(results: Results) -> dict[str, dict[int, tuple[int, int]]]:
     """By group and case, how many of how many conditions were left out because no input within the bounds holds the set point."""
     robust = read(results, "robustness", "robustness.csv")
     place = ["case", "group", "row", "column"]
-    total, out = (
-        robust[place].drop_duplicates().groupby(["group", "case"]).size(),
-        unholdable(results).groupby(["group", "case"]).size(),
-    )
+    total = robust[place].drop_duplicates().groupby(["group", "case"]).size()
+    out = unholdable(results).groupby(["group", "case"]).size()
     found: dict[str, dict[int, tuple[int, int]]] = {}
     for (group, case), count in out.items():
         found.setdefault(group, {})[int(case)] = (int(count), int(total[group, case]))
@@ -185,12 +190,9 @@ def left_out(results: Results) -> dict[str, dict[int, tuple[int, int]]]:
 def out_of_reach(results: Results) -> dict[str, list[int]]:
     """By mismatched plant that was improved on, the cases of which no input within the bounds holds the set point there."""
     out = unholdable(results).query("group == 'model'")
-    plants = zip(out["row"].astype(float), out["column"].astype(float), out["case"], strict=True)
-    cases: dict[str, list[int]] = {plant: [] for plant in on_mismatch(results)["plant"].unique()}
-    for state, entry, case in plants:
-        if (plant := f"A x {state:g}, B x {entry:g}") in cases:
-            cases[plant].append(int(case))
-    return {plant: found for plant, found in cases.items() if found}
+    out = out.assign(plant=plant_names(out["row"].astype(float), out["column"].astype(float)))
+    found: dict[str, list[int]] = out[out["plant"].isin(on_mismatch(results)["plant"])].groupby("plant")["case"].agg(list).to_dict()
+    return found
 
 
 def there(results: Results) -> dict[str, dict[int, list[str]]]:

@@ -1,6 +1,6 @@
 """The section of the report on limits and alternatives: tables and figures from what notebook 06 wrote, where it was run."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 import pandas as pd
@@ -9,7 +9,7 @@ from scipy.optimize import lsq_linear
 
 from helpers import scorecard
 from helpers.collection import Results
-from helpers.limits_figures import GRIDS, LABELS, budget_curves, gap_figure, heat_maps
+from helpers.limits_figures import GRIDS, LABELS, LEARNERS, budget_curves, gap_figure, heat_maps
 from helpers.params import Params
 from helpers.tables import NOT_KNOWN, ROMAN, spread, symbol
 
@@ -47,7 +47,7 @@ SAFETY = {  # of the online epochs, with their units
 }
 GROUPS = {"model": "model", "noise": "noise", "set_point": "set points", "time": "dead time and load"}
 THE_PAPERS = "irl_reinforce"
-RIVALS = ("clone_reinforce", "scratch_reinforce", "ppo", "recurrent_ppo", "pid_tuned")
+RIVALS = tuple(name for name in LEARNERS if name != THE_PAPERS)  # they need no model
 RUNS = {"hot": "hot start", "scratch": "from scratch"}
 
 
@@ -82,6 +82,16 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
         **{f"limits_{table}": _quality(quality, figures) for table, figures in QUALITY.items()},
         "limits_safety": _wide(safety.rename(columns={"run": "controller"}), str, "{}", SAFETY, RUNS),
     } | ({"limits_curves": budget} if len(budget) else {})
+
+
+def sharpest(results: Results, gaps: pd.DataFrame) -> pd.DataFrame:
+    """The gaps under the headline beta of their case."""
+    return gaps[gaps["beta"] == gaps["case"].map(lambda case: results.params[case].case.online.headline_beta)]
+
+
+def plant_names(states: Iterable[float], inputs: Iterable[float]) -> list[str]:
+    """Plants that are not the model, by their factors of A and B."""
+    return [f"A x {state:g}, B x {entry:g}" for state, entry in zip(states, inputs, strict=True)]
 
 
 def unholdable(results: Results) -> pd.DataFrame:
@@ -126,8 +136,7 @@ def on_mismatch(results: Results) -> pd.DataFrame:
     grid = robust[robust["group"] == "model"].astype({"row": float, "column": float})
     grid = grid.rename(columns={"row": "state", "column": "input"}).merge(there[["state", "input"]].drop_duplicates())
     every = pd.concat([there, grid[~grid["controller"].isin(there["controller"])]], ignore_index=True)
-    plants = [f"A x {state:g}, B x {entry:g}" for state, entry in zip(every["state"], every["input"], strict=True)]
-    return every.assign(plant=plants)[["case", "seed", "plant", "controller", "objective"]]
+    return every.assign(plant=plant_names(every["state"], every["input"]))[["case", "seed", "plant", "controller", "objective"]]
 
 
 def summary(frame: pd.DataFrame) -> pd.DataFrame:
@@ -262,10 +271,8 @@ def draw(results: Results) -> dict[str, Figure]:
     drawn = {}
     for case in sorted(gaps["case"].unique()) if len(gaps) else ():
         own = gaps[gaps["case"] == case]
-        sharp = own[own["beta"] == results.params[case].case.online.headline_beta]
-        drawn[f"limits_budget_case_{case}"] = budget_curves(
-            curves[curves["case"] == case], sharp.groupby("controller")["objective"].median()
-        )
+        levels = sharpest(results, own).groupby("controller")["objective"].median()
+        drawn[f"limits_budget_case_{case}"] = budget_curves(curves[curves["case"] == case], levels)
         shown = _with_interval(own, "gap", ("gap_low", "gap_high"))
         shown = shown.rename(columns={"median": "gap", "ci_low": "gap_low", "ci_high": "gap_high"})
         drawn[f"limits_gaps_case_{case}"] = gap_figure(shown)

@@ -5,14 +5,20 @@ KILLS ?= 100
 SCALE ?= paper
 CORES ?= 2
 VENV := .venv
-BIN := $(VENV)/bin
+BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 # One thread a process: stages run side by side, and results must not depend on how many.
 export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
+PYTEST = $(BIN)/python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder --nbval
 SNAKEMAKE = $(BIN)/python -m snakemake --profile profiles/local --cores $(CORES)
 
-.PHONY: help setup reports evidence smoke test lab bench torture cluster publish notebooks clean
+# Tests of numbers: what another processor may round otherwise.
+NUMERICAL := $(addprefix tests/test_,$(addsuffix .py,alternatives attainable cloning control_quality controllers deployment evaluation \
+	experiments features guard identification kalman limits maxent_irl mismatch mpc nonlinear_tank optimiser own_plant plant_model policy \
+	process reinforce rollout stages statistics system_identification))
+
+.PHONY: help setup reports evidence smoke test portable lock lab bench torture cluster publish notebooks clean
 
 help:  ## show this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-10s %s\n", $$1, $$2}'
@@ -50,7 +56,16 @@ test: setup  ## style, types, layers, tests and the notebooks against their stor
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder --nbval notebooks tests
+	$(PYTEST) notebooks tests
+
+portable: setup  ## the notebooks and the numerical tests as on an older processor, and with AVX2 where this one has AVX-512
+	$(BIN)/python -m torture.processors older -- $(PYTEST) notebooks $(NUMERICAL)
+	$(BIN)/python -m torture.processors avx2 -- $(PYTEST) notebooks $(NUMERICAL)
+
+lock: setup  ## write pylock.toml from environment.txt: every package of every system with its hash
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/python -m uv pip compile environment.txt --quiet --universal --python-version 3.11.5 --generate-hashes --no-header \
+		--format pylock.toml --output-file pylock.toml
 
 lab: setup  ## open JupyterLab on the notebooks
 	$(BIN)/python -m jupyter lab notebooks
@@ -59,7 +74,8 @@ bench: setup  ## measure speed against the machine's bound and other ways; write
 	$(BIN)/python -m pip install --quiet --constraint environment.txt --editable ".[bench]"
 	$(BIN)/python -m benchmarks.benchmark --whole --cores $(CORES)
 
-torture: setup  ## kill a run KILLS times, crowd notebooks, feed nonsense; writes reports/reference/reliability.md
+torture: setup  ## the slow tests; kill a run KILLS times, crowd notebooks, feed nonsense; writes reports/reference/reliability.md
+	$(BIN)/python -m pytest --numprocesses $(CORES) --dist loadfile -m torture
 	$(BIN)/python -m torture.torture --kills $(KILLS)
 
 cluster: setup  ## as root on Debian: install SLURM, run the smoke scale through it, compare, stop it (ACCOUNTING=1: with a database)

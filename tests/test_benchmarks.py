@@ -198,6 +198,7 @@ def test_peak_memory_is_that_of_learning_alone():
     assert 0 <= benchmark.peak_memory([(12, 4)])[12, 4] < 50
 
 
+@pytest.mark.torture
 def test_a_quick_run_writes_everything(written):
     frame = pd.read_csv(written / "benchmarks.csv")
     size = subjects.QUICK
@@ -221,6 +222,7 @@ def test_a_quick_run_writes_everything(written):
     }
 
 
+@pytest.mark.torture
 def test_the_summary_begins_with_ratios_and_no_file_names_a_place(written):
     text = (written / "summary.md").read_text(encoding="utf-8")
     assert text.index("Ratio") < text.index("Seconds")
@@ -232,6 +234,7 @@ def test_the_summary_begins_with_ratios_and_no_file_names_a_place(written):
         assert platform.node() not in content
 
 
+@pytest.mark.torture
 def test_what_a_run_writes_is_no_change_of_the_code_it_measured(written):
     row = next(line for line in (written / "machine.md").read_text(encoding="utf-8").splitlines() if "code" in line.lower())
     assert row.split("|")[2].strip() == "abc"

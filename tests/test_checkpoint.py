@@ -1,6 +1,9 @@
 """Checkpoints: a training that was killed goes on to the very same bits; what is not its own state is never taken for it."""
 
 import json
+import multiprocessing
+import os
+import signal
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -69,10 +72,15 @@ def assert_equal(found, expected):
 
 
 # The printed variant has several epochs in an iteration, and stops early; so has a trial with the natural gradient no moments.
-LEARNING = [(offline, "improved", dtype) for dtype in ("float32", "float64")]
-LEARNING += [(online, "improved", dtype) for dtype in ("float32", "float64")]
-LEARNING += [(offline, "printed", "float32"), (offline, "natural_gradient", "float32")]
-LEARNING += [(frozen, "improved", "float32"), (budgeted, "improved", "float32")]
+LEARNING = [(offline, "printed", "float32"), (budgeted, "improved", "float32")]
+MORE = [
+    (online, "improved", "float64"),
+    (offline, "improved", "float32"),
+    (offline, "improved", "float64"),
+    (online, "improved", "float32"),
+]
+MORE += [(offline, "natural_gradient", "float32"), (frozen, "improved", "float32")]
+LEARNING += [pytest.param(*case, marks=pytest.mark.torture) for case in MORE]
 
 
 @pytest.mark.parametrize(("learn", "variant", "dtype"), LEARNING)
@@ -91,6 +99,26 @@ def test_a_training_killed_again_and_again_ends_at_the_very_same_bits(tmp_path, 
     resumed = run(tmp_path / "killed", variant, dtype)
     assert_equal(learn(resumed), undisturbed)
     assert [path.suffix for path in (tmp_path / "killed").iterdir()] == [".safetensors"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a process is forked and killed by signal 9")
+def test_a_training_killed_by_the_system_goes_on_to_the_very_same_bits(tmp_path):
+    undisturbed = online(run(tmp_path / "undisturbed"))
+    child = multiprocessing.get_context("fork").Process(target=_until_killed, args=(tmp_path / "killed",))
+    child.start()
+    child.join()
+    assert child.exitcode == -signal.SIGKILL
+    assert len(list((tmp_path / "killed").glob("*.safetensors"))) == 1
+    assert_equal(online(run(tmp_path / "killed")), undisturbed)
+
+
+def _until_killed(folder):
+    opened = run(folder)
+    opened.checkpoints.lives = 2
+    try:
+        online(opened)
+    except KilledError:
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_a_finished_training_is_not_repeated(tmp_path, monkeypatch):

@@ -38,8 +38,8 @@ def responses(x, u=None):
 def test_the_standard_error_is_that_of_scipy():
     samples = torch.randn(200, 3, generator=stream(0, "samples"), dtype=F64) * torch.tensor([1.0, 5.0, 0.1]) + 2
     found = monte_carlo(samples)
-    np.testing.assert_allclose(found.mean, samples.numpy().mean(0), rtol=1e-13)
-    np.testing.assert_allclose(found.standard_error, sem(samples.numpy()), rtol=1e-13)
+    np.testing.assert_allclose(found.mean, samples.numpy().mean(0), rtol=1e-12)
+    np.testing.assert_allclose(found.standard_error, sem(samples.numpy()), rtol=1e-12)
 
 
 @pytest.mark.equation("S1")

@@ -145,7 +145,7 @@ def test_the_baseline_lowers_the_spread(prepared):
     run = prepared()
     found = experiments.gradient_spread(run)["gradient"]
     assert found["variance:none"] == 1.0
-    assert 0 < found["variance:regression"] < found["variance:mean"] < 1
+    assert all(0 < found[f"variance:{kind}"] < 0.5 for kind in ("mean", "regression"))
 
 
 def test_what_is_not_planned_is_not_run(prepared):

@@ -1,5 +1,7 @@
 """The verbs of notebook 06, at a size where each can be checked by another route."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -44,6 +46,7 @@ def test_the_grids_say_whether_they_agree(contest, attained):
         assert row["value"] == pytest.approx(row["monte_carlo"] * (1 + row["difference"]))
 
 
+@pytest.mark.torture
 def test_every_alternative_has_a_curve_and_spends_no_more_than_its_budget(contest, learned):
     curves = equal_budget.curves(learned)
     assert set(learned) == {"clone", "irl_reinforce", "clone_reinforce", "scratch_reinforce", "pid_tuned", "mpc"}
@@ -119,9 +122,18 @@ def test_the_scorecard_holds_every_figure_of_every_controller(contest, attained)
     assert (table.xs("iae_worst:T", level="figure") >= table.xs("iae:T", level="figure")).all()
 
 
+def everywhere(contest):
+    """The contest under every condition, as at paper scale."""
+    scale = contest.scale.model_copy(update={"corners": False})
+    return replace(contest, params=contest.params.model_copy(update={"scales": {contest.session.scale: scale}}))
+
+
 def test_conditions_differ_in_what_they_name(contest):
-    found = {(one.group, one.row, one.column): one for one in robustness.conditions(contest)}
+    found = {(one.group, one.row, one.column): one for one in robustness.conditions(everywhere(contest))}
     assert len(found) == 25 + 16 + 16 + 4
+    at_the_corners = [(one.group, one.row, one.column) for one in robustness.conditions(contest)]
+    assert len(at_the_corners) == 4 * 4
+    assert set(at_the_corners) < found.keys()
     nominal = contest.session.process
     scaled = found["model", "1.3", "0.7"].plant.process
     assert torch.allclose(scaled.drift_state, 1.3 * nominal.drift_state)
@@ -136,7 +148,7 @@ def test_conditions_differ_in_what_they_name(contest):
 
 
 def test_nominal_conditions_give_the_nominal_objective(contest):
-    table = robustness.robustness(contest, {"expert": lambda run: run.expert})
+    table = robustness.robustness(everywhere(contest), {"expert": lambda run: run.expert})
     table = table.set_index(["group", "row", "column"])["objective"]
     returns = contest.returns(stages.fresh_trajectories(contest.session, contest.session.expert, contest.scale.grid)).mean()
     for key in (("model", "1", "1"), ("noise", "1", "1"), ("set_point", "1", "1"), ("time", "0", "0")):

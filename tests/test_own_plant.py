@@ -95,7 +95,7 @@ def quick_root(root, tmp_path):
     folder = shutil.copytree(root, tmp_path / "params")
     text = (folder / "learning.yaml").read_text(encoding="utf-8")
     for old, new in (
-        ("epoch_share: {value: 0.1,", "epoch_share: {value: 0.02,"),
+        ("epoch_share: {value: 0.05,", "epoch_share: {value: 0.02,"),
         ("episodes: {value: 40,", "episodes: {value: 16,"),
         ("evaluation: {value: 100,", "evaluation: {value: 10,"),
         ("hidden_cells: {value: [20, 20]", "hidden_cells: {value: [6, 6]"),

@@ -83,7 +83,7 @@ def test_forward_is_the_textbook_lstm_with_leaky_relu_on_each_output(study, hidd
     assert mean.std(0).min() > 1e-2  # the comparison is not one of constants
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-6), (F64, 1e-12)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (F64, 1e-12)])
 @pytest.mark.parametrize("exploring", [True, False])
 @pytest.mark.parametrize("factor", [1.0, 3.0])
 def test_fast_stepping_agrees_with_forward_along_whole_trajectories(study, dtype, tolerance, exploring, factor):
@@ -111,8 +111,9 @@ def test_the_mode_has_no_noise_and_exploring_has_the_stated_spread(study):
     command, _ = controller.act(y, controller.start(len(y), 1, stream(0, "spread")))
     deployed = PolicyController(policy, case.task, exploring=False)
     mode, _ = deployed.act(y, deployed.start(len(y), 1, stream(0)))
-    assert (mode == mode[0]).all()
-    share = ((command - mode) / (case.task.input_high - case.task.input_low)).numpy()
+    span = case.task.input_high - case.task.input_low
+    assert ((mode - mode[0]).abs() / span).max() < 1e-12  # a product may round one column otherwise than the next
+    share = ((command - mode) / span).numpy()
     spread = policy.params.initial_std
     np.testing.assert_array_less(np.abs(share.mean(0)), 5 * spread / np.sqrt(len(y)))
     np.testing.assert_allclose(share.std(0), spread, rtol=5 / np.sqrt(2 * len(y)))

@@ -373,6 +373,7 @@ def test_an_entropy_bonus_keeps_exploration_up(study, settings, minibatches):
     assert spread(1.0) > spread(0.0) + 0.003
 
 
+@pytest.mark.torture
 def test_the_natural_gradient_raises_the_return_on_an_easy_task(study, settings):
     """As the test of the variants above, in as many steps: the policy's distribution moves by the trust region in each."""
     case = study(1, torch.float32)

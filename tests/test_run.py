@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+from collections import Counter
 from pathlib import Path
 
 import nbformat
@@ -16,6 +17,7 @@ from helpers import identity, run
 from helpers.artifacts import load_stage
 from helpers.sources import PROJECT
 
+SLOW = pytest.mark.torture
 PAPERMILL = [sys.executable, "-m", "papermill", "--no-progress-bar"]
 
 
@@ -212,6 +214,7 @@ def test_a_kernel_that_dies_is_told(here, toy, capfd):
     assert "error: 02_offline_irl: the kernel died" in capfd.readouterr().err
 
 
+@pytest.mark.torture
 def test_plain_papermill_refuses_a_misspelt_parameter(here):
     """papermill itself only warns; the notebook's first cell ends the run."""
     notebook = PROJECT / "notebooks/01_demonstrations.ipynb"
@@ -226,26 +229,32 @@ def test_plain_papermill_refuses_a_misspelt_parameter(here):
 
 
 @pytest.fixture
-def plan(tmp_path):
-    """A copy of what the Snakefile reads, so that files can be touched; returns the jobs that it would run, by rule."""
+def source(tmp_path):
+    """A copy of what results are made from and of what plans them, to be changed."""
     copy = tmp_path / "copy"
     for part in ("params", "profiles", "src/helpers", "reports/template"):
         shutil.copytree(PROJECT / part, copy / part, ignore=shutil.ignore_patterns("__pycache__"))
     (copy / "notebooks").mkdir()
     for path in (PROJECT / "Snakefile", *(PROJECT / "notebooks").glob("*.ipynb")):
         shutil.copy(path, copy / path.relative_to(PROJECT))
+    return copy
+
+
+@pytest.fixture
+def plan(source):
+    """The jobs that the Snakefile would run in that copy, by rule."""
 
     def dry_run(*targets, **config):
         settings = [f"{name}={value}" for name, value in ({"scale": "smoke", "reports": "report"} | config).items()]
         snakemake = [sys.executable, "-m", "snakemake", "-n", "--profile", "profiles/local", "--cores", "1", "--nolock"]
         done = subprocess.run(
-            [*snakemake, "--config", *settings, "--", *targets], cwd=copy, capture_output=True, text=True, check=False
+            [*snakemake, "--config", *settings, "--", *targets], cwd=source, capture_output=True, text=True, check=False
         )
         assert done.returncode == 0, done.stderr
         counts = dict(re.findall(r"^(\w+) +(\d+)$", (done.stdout + done.stderr), re.MULTILINE))
         return {rule: int(count) for rule, count in counts.items() if rule not in ("all", "total")}
 
-    dry_run.folder = copy
+    dry_run.folder = source
     return dry_run
 
 
@@ -287,17 +296,18 @@ def test_the_whole_run_is_fourteen_jobs_with_all_and_each_seed_repeats_its_stage
 @pytest.mark.parametrize(
     ("target", "jobs"),
     [
-        (STAGE.format(2, "demonstrations"), {"demonstrations": 1}),
-        (STAGE.format(2, "online_improved"), {"demonstrations": 1, "offline": 1, "online": 1}),
-        (STAGE.format(3, "online_improved"), {"demonstrations": 2, "offline": 1, "transfer": 1}),
         (STAGE.format(3, "transfer_printed"), {"demonstrations": 2, "offline": 1, "transfer_alone": 1}),
+        pytest.param(STAGE.format(2, "demonstrations"), {"demonstrations": 1}, marks=SLOW),
+        pytest.param(STAGE.format(2, "online_improved"), {"demonstrations": 1, "offline": 1, "online": 1}, marks=SLOW),
+        pytest.param(STAGE.format(3, "online_improved"), {"demonstrations": 2, "offline": 1, "transfer": 1}, marks=SLOW),
     ],
-    ids=["recording", "online", "transfer", "transfer alone"],
+    ids=["transfer alone", "recording", "online", "transfer"],
 )
 def test_a_stage_asked_for_alone_runs_only_what_it_needs(plan, target, jobs):
     assert plan(target) == jobs
 
 
+@pytest.mark.torture
 def test_finished_stages_are_skipped(finished):
     assert finished() == {}
     for path in (STAGE.format(2, "online_improved"), "report/report.html"):
@@ -305,52 +315,77 @@ def test_finished_stages_are_skipped(finished):
     assert finished() == {"online": 1, "report": 1}
 
 
+# What is made from what ------------------------------------------------------------------------------------------------
+
+RESULTS = {  # by rule of the Snakefile: the notebook, case and variant of each of its results
+    "demonstrations": [("01_demonstrations", case, "improved") for case in (1, 2, 3)],
+    "offline": [("02_offline_irl", case, variant) for case in (1, 2) for variant in ("improved", "printed")]
+    + [("02_offline_irl", 3, "improved")],
+    "online": [("03_online_improvement", case, "improved") for case in (1, 2)],
+    "transfer": [("04_knowledge_transfer", 3, "improved")],
+    "transfer_alone": [("04_knowledge_transfer", 3, "printed")],
+    "report": [("05_report", None, "improved")],
+}
+EVERYTHING = {rule: len(results) for rule, results in RESULTS.items()}
+LEARNT = {rule: number for rule, number in EVERYTHING.items() if rule != "report"}
+ADDED = None  # in place of words to replace: a line at the end
+
+
+def edited(text, old, new):
+    """The text with one change."""
+    if old is ADDED:
+        return text + new
+    assert old in text
+    return text.replace(old, new, 1)
+
+
+EDITS = [
+    ("params/case_2.yaml", "250", "249", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
+    ("params/learning.yaml", "std_high: {value: 0.25", "std_high: {value: 0.3", ONLINE),
+    ("params/learning.yaml", "episodes: {value: 400", "episodes: {value: 300", {"report": 1}),  # of another scale
+    ("params/published.yaml", "21.63", "21.64", {"report": 1}),
+    ("notebooks/04_knowledge_transfer.ipynb", "carried = ", "taken = ", {"transfer": 1, "transfer_alone": 1}),
+    ("src/helpers/maxent_irl.py", ADDED, "# a comment\n", {}),
+    ("src/helpers/maxent_irl.py", "return project(self.mean)", "return project(self.mean.clone())", LEARNT),
+    ("src/helpers/report.py", "RUNNERS = (", "RUNNERS = (*(),", {"report": 1}),
+    ("src/helpers/figures.py", "MUTED = ", "MUTED: str = ", EVERYTHING),  # stages store what they draw (response.csv)
+]
+
+
+def test_a_change_makes_exactly_the_results_stale_that_are_made_from_it(source):
+    def made_from():
+        results = [(rule, *run) for rule, runs in RESULTS.items() for run in runs]
+        return {(rule, *run): identity.inputs(run[0], source / "params", "smoke", *run[1:], source) for rule, *run in results}
+
+    before = made_from()
+    for changed, old, new, stale in EDITS:
+        path = source / changed
+        text = path.read_text(encoding="utf-8")
+        path.write_text(edited(text, old, new), encoding="utf-8")
+        after = made_from()
+        assert Counter(result[0] for result in before if after[result] != before[result]) == stale, (changed, new)
+        path.write_text(text, encoding="utf-8")
+
+
 @pytest.mark.parametrize(
     ("changed", "old", "new", "jobs"),
     [
         ("params/case_2.yaml", "250", "249", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
-        ("params/learning.yaml", "std_high: {value: 0.25", "std_high: {value: 0.3", ONLINE),
-        ("params/learning.yaml", "episodes: {value: 400", "episodes: {value: 300", {"report": 1}),  # of another scale
-        ("notebooks/04_knowledge_transfer.ipynb", "carried = ", "taken = ", {"transfer": 1, "transfer_alone": 1, "report": 1}),
-        ("src/helpers/maxent_irl.py", "projected", "", {}),
-        ("src/helpers/maxent_irl.py", "return project(self.mean)", "return project(self.mean.clone())", ONE_SEED),
-        ("reports/template/report.md.jinja", "# In one page", "# In a page", {"report": 1}),
-        ("src/helpers/figures.py", "MUTED = ", "MUTED: str = ", ONE_SEED),  # stages store what they draw (response.csv)
+        pytest.param("src/helpers/maxent_irl.py", ADDED, "# a comment\n", {}, marks=SLOW),
+        pytest.param("src/helpers/maxent_irl.py", "(self.mean)", "(+self.mean)", ONE_SEED, marks=SLOW),
+        pytest.param("reports/template/report.md.jinja", "# In one page", "# In a page", {"report": 1}, marks=SLOW),
     ],
 )
-def test_a_change_makes_exactly_what_depends_on_it_run_again(finished, changed, old, new, jobs):
+def test_what_is_stale_is_run_again_with_all_that_read_it(finished, changed, old, new, jobs):
     path = finished.folder / changed
     before = path.read_text(encoding="utf-8")
-    path.touch()
-    if jobs:
-        assert old in before
-        path.write_text(before.replace(old, new, 1), encoding="utf-8")
-    else:
-        path.write_text(f"{before}# a comment\n", encoding="utf-8")
+    path.write_text(edited(before, old, new), encoding="utf-8")
     assert finished() == jobs
-    if changed == "params/case_2.yaml":
-        second = {rule: jobs.get(rule, 0) + count - (rule == "report") for rule, count in ONE_SEED.items()}
-        assert finished(seeds=2) == second  # of which there is nothing yet
-        path.write_text(before, encoding="utf-8")
-        assert finished() == {}  # whatever the times of the files
+    path.write_text(before, encoding="utf-8")
+    assert finished() == {}  # whatever the times of the files
 
 
-@pytest.mark.parametrize(
-    ("changed", "old", "new"),
-    [("params/published.yaml", "21.63", "21.64"), ("src/helpers/report.py", "RUNNERS = (", "RUNNERS = (*(),")],
-)
-def test_a_change_to_what_the_report_alone_reads_leaves_every_stage_as_it_is(plan, changed, old, new):
-    def made_from():
-        stages = {"05_report": (None, "improved"), "02_offline_irl": (1, "printed"), "04_knowledge_transfer": (3, "improved")}
-        folder = plan.folder
-        return {name: identity.inputs(name, folder / "params", "smoke", *run, folder) for name, run in stages.items()}
-
-    before = made_from()
-    text = (plan.folder / changed).read_text(encoding="utf-8")
-    (plan.folder / changed).write_text(text.replace(old, new, 1), encoding="utf-8")
-    assert [name for name, inputs in made_from().items() if inputs != before[name]] == ["05_report"]
-
-
+@pytest.mark.torture
 def test_results_that_were_removed_are_made_again_whatever_else_has_changed(finished):
     shutil.rmtree(finished.folder / "results")
     path = finished.folder / "src/helpers/report.py"
@@ -358,6 +393,7 @@ def test_results_that_were_removed_are_made_again_whatever_else_has_changed(fini
     assert finished() == ONE_SEED
 
 
+@pytest.mark.torture
 @pytest.mark.parametrize("name", ["summary.md", "machine.md", "scaling.svg"])
 def test_what_make_bench_wrote_last_goes_into_the_report(finished, name):
     folder = finished.folder / "reports/reference/benchmarks"
@@ -370,7 +406,10 @@ def test_what_make_bench_wrote_last_goes_into_the_report(finished, name):
 
 @pytest.mark.parametrize(
     ("scale", "says"),
-    [("smoke", "\n1 notebook(s) failed; "), ("huge", "\nNo notebook failed, what went wrong stands above; ")],
+    [
+        ("smoke", "\n1 notebook(s) failed; "),
+        pytest.param("huge", "\nNo notebook failed, what went wrong stands above; ", marks=SLOW),
+    ],
     ids=["a parameter file", "the command"],
 )
 def test_the_summary_tells_what_was_refused_before_it_ran(plan, scale, says):
@@ -387,11 +426,13 @@ def test_the_summary_tells_what_was_refused_before_it_ran(plan, scale, says):
     assert ("case_2.yaml: " in said) is (scale == "smoke")
 
 
+@pytest.mark.torture
 def test_a_damaged_record_is_made_again(finished):
     (finished.folder / STAGE.format(2, "online_improved")).write_text("{")
     assert finished() == {"online": 1, "report": 1}
 
 
+@pytest.mark.torture
 def test_a_report_of_the_seeds_that_are_whole_is_made_only_when_asked(finished):
     (finished.folder / STAGE.format(2, "online_improved")).unlink()
     (finished.folder / "report/report.html").unlink()

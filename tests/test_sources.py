@@ -24,7 +24,9 @@ def import_statements(notebook):
     return "\n".join(ast.unparse(node) for node in nodes if isinstance(node, (ast.Import, ast.ImportFrom)))
 
 
-@pytest.mark.parametrize(("notebook", "among"), [("02_offline_irl", {"drawings"}), ("05_report", {"collection"})])
+@pytest.mark.parametrize(
+    ("notebook", "among"), [("02_offline_irl", {"drawings"}), pytest.param("05_report", {"collection"}, marks=pytest.mark.torture)]
+)
 def test_every_module_that_python_imports_is_found(notebook, among):
     code = IMPORTS.format(code=import_statements(notebook))
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -150,8 +150,9 @@ def test_what_was_spent_stays_within_the_budget(learned, case, variant):
     run, _, offline, online, _ = learned if (case, variant) == (1, "improved") else learn(case, variant)
     epochs, rounds = EPOCHS_OF_THE_PAPER[case]
     budget = run.scale_params.episodes + run.scale_params.measured
-    for records, most in ((offline.records, epochs), (online.records, sum(rounds))):
-        assert records[-1].epochs <= max(1, round(most * run.scale_params.epoch_share))
+    share = run.scale_params.epoch_share
+    for records, parts in ((offline.records, [epochs]), (online.records, rounds)):
+        assert records[-1].epochs <= sum(max(1, round(part * share)) for part in parts)
         assert all(record.episodes <= budget * record.epochs for record in records)
     assert 1 <= offline.chosen_epoch <= offline.records[-1].epochs
     if variant == "printed":
@@ -166,6 +167,7 @@ def test_a_rerun_is_bit_equal(learned):
     assert learn()[-1] == learned[-1]
 
 
+@pytest.mark.torture
 def test_a_rerun_with_another_number_of_threads_is_bit_equal(learned):
     """Other processes, whatever their environment says: the scale sets the threads."""
     environment = os.environ | {"OMP_NUM_THREADS": "2", "MKL_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2", "TQDM_DISABLE": "1"}

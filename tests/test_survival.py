@@ -62,6 +62,7 @@ def small(tmp_path_factory, closed):
     return place, expected, seconds
 
 
+@pytest.mark.torture
 def test_nothing_reaches_the_network_while_notebooks_run(small, closed):
     _, expected, _ = small
     environment, _, log = closed
@@ -73,6 +74,7 @@ def test_nothing_reaches_the_network_while_notebooks_run(small, closed):
     assert "192.0.2.1" in log.read_text()
 
 
+@pytest.mark.torture
 def test_five_random_kills_lose_nothing_and_change_nothing(small):
     place, expected, seconds = small
     part = replace(place, targets=KILLED)
@@ -92,6 +94,7 @@ def test_a_strike_that_finds_nobody_is_no_kill():
     assert found == [None] * 3
 
 
+@pytest.mark.torture
 def test_one_seed_that_fails_stops_no_other_and_is_named_once(small, tmp_path):
     place, expected, _ = small
     targets = tuple(STAGE.format(seed, 2, "offline_improved") for seed in (0, 1))
@@ -137,6 +140,7 @@ def record(folder, environment=None):
     return done.returncode, done.stderr.strip()
 
 
+@pytest.mark.torture
 def test_a_full_disk_and_a_read_only_one_end_in_a_sentence_and_the_run_resumes(small, disk):
     _, expected, _ = small
     folder, again = disk

@@ -130,6 +130,7 @@ def test_a_trial_meets_the_random_numbers_of_its_base(improved):
     assert not all(torch.equal(mine, its) for mine, its in kept)
 
 
+@pytest.mark.torture
 def test_exploration_is_that_of_the_trial(improved):
     run = session(variant="wide_exploration")
     assert imitated(run).records[0].policy_std == pytest.approx(run.variant_params.exploration.initial_std, rel=0.1)

@@ -78,7 +78,7 @@ class Checkpoint:
                 header = file.metadata() or {}
                 if header.get("training") != self.training:
                     return None
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dictionary)
+                tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dictionary)
                 state: State = _assemble(json.loads(header["state"]), tensors)
                 return state
         except (OSError, SafetensorError, KeyError, ValueError):  # missing or damaged: the training starts anew

@@ -13,6 +13,7 @@ from helpers.limits_params import QualityParams
 from helpers.trajectories import Trajectories
 
 RISE = (0.1, 0.9)
+AT_BOUND = 1e-6  # share of the range: an interpolated input may miss its bound by a last digit
 
 
 def integral_errors(error: Tensor, sampling_time: float) -> dict[str, Tensor]:
@@ -82,8 +83,8 @@ def harris_index(deviation: np.ndarray, order: int) -> float:
 
 def input_figures(trajectories: Trajectories, low: Tensor, high: Tensor) -> dict[str, Tensor]:
     """Total variation sum_t |u_t - u_(t-1)|, mean over trajectories, and share of samples at a bound; each (n_u,)."""
-    u = trajectories.u
-    at_bound = (u <= low) | (u >= high)
+    u, reach = trajectories.u, AT_BOUND * (high - low)
+    at_bound = (u <= low + reach) | (u >= high - reach)
     return {"total_variation": u.diff(dim=0).abs().sum(0).mean(0), "at_bound": at_bound.to(u.dtype).mean((0, 1))}
 
 

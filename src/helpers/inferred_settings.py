@@ -219,7 +219,7 @@ def compare_readings(study: Study, joint: Fit, second: Fit) -> pd.DataFrame:
     session, scale, manipulated = study.session, study.session.scale_params, study.any_params.process.manipulated
     start = {**study.filed(study.first), **joint.settings}
     rows = []
-    for reading in READINGS:
+    for reading in READINGS[: scale.readings]:
         errors = sampling_errors(session, reading)
         problem = replace(study.problem(study.first, shared=True, reading=reading), sampling_error=errors)
         found = study.refit(problem, start)

@@ -108,6 +108,7 @@ class LimitsScaleParams(Record):
     judged: Annotated[Count, Field(gt=1), Leaf("trajectories")]
     at_rest: Annotated[Count, Field(gt=1), Leaf("samples")]
     grid: Annotated[Count, Field(gt=1), Leaf("trajectories")]
+    corners: Annotated[bool, Strict(), Leaf("-")]
     library: Annotated[bool, Strict(), Leaf("-")]
 
     @model_validator(mode="after")

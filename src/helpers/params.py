@@ -533,6 +533,7 @@ class IdentificationScaleParams(Record):
     iterations: Annotated[Count, Leaf("iterations")]
     profile_steps: Annotated[Count, Leaf("steps to each side")]
     fresh: Annotated[Count, Field(gt=1), Leaf("trajectories")]
+    readings: Annotated[Count, Leaf("readings")]
 
 
 class IdentificationParams(Record):

@@ -29,6 +29,7 @@ from helpers.session import parameters_hash
 from helpers.sources import PROJECT
 
 RUNNERS = ("papermill", "snakemake", "pypandoc_binary")  # packages that shape no number
+SHOWN_AS_PIXELS = ("figure_3",)  # in README, where a reader without a browser of its own meets it
 COLOURS = 128  # of a PNG: a third of the size, and no difference that the eye sees
 PROVENANCE = "provenance.json"
 OWN_ERROR = "as in the parameter files, with each trajectory's own |e| before the first step"  # what notebook 00 calls its main one
@@ -169,11 +170,12 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
             drawing = io.StringIO()
             figure.savefig(drawing, format="svg", metadata={"Date": None})
             (partial / "figures" / f"{name}.svg").write_text(shortened(drawing.getvalue()), encoding="utf-8")
-            figure.set_layout_engine("none")  # it stays as the first file was laid out: a layout costs as much as drawing
-            pixels = io.BytesIO()
-            figure.savefig(pixels)
-            palette = Image.open(pixels).convert("RGB").quantize(COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-            palette.save(partial / "figures" / f"{name}.png", optimize=True)
+            if name in SHOWN_AS_PIXELS:
+                figure.set_layout_engine("none")  # it stays as the first file was laid out: a layout costs as much as drawing
+                pixels = io.BytesIO()
+                figure.savefig(pixels)
+                palette = Image.open(pixels).convert("RGB").quantize(COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+                palette.save(partial / "figures" / f"{name}.png", optimize=True)
         for name, frame in tabulated.items():
             frame.to_csv(partial / "tables" / f"{name}.csv", index=False, float_format="%.10g")
             (partial / "tables" / f"{name}.md").write_text(tables.to_markdown(frame) + "\n", encoding="utf-8")
@@ -181,8 +183,7 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
         results.seeds.to_csv(partial / "seeds.csv", index=False, float_format="%.10g")
         (partial / PROVENANCE).write_text(json.dumps(origin, indent=1) + "\n", encoding="utf-8")
         if results.inferred is not None:
-            for ending in ("svg", "png"):
-                shutil.copy2(results.inferred.path(f"profiles.{ending}"), partial / f"figures/inferred_profiles.{ending}")
+            shutil.copy2(results.inferred.path("profiles.svg"), partial / "figures/inferred_profiles.svg")
         if (BENCHMARKS / "scaling.svg").is_file():
             shutil.copy2(BENCHMARKS / "scaling.svg", partial / "figures/benchmarks.svg")
         text = render(results, tabulated, origin)

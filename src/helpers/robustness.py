@@ -35,24 +35,27 @@ class Condition(NamedTuple):
 
 
 def conditions(contest: Contest) -> list[Condition]:
-    """Every plant and set point of params/limits.yaml."""
+    """Every plant and set point of params/limits.yaml; at a scale of `corners`, the first and last factor of each list alone."""
     session, params = contest.session, contest.params.robustness
     process, case = session.params.process, session.params.case
+    grids = params.model_dump()
+    if contest.scale.corners:
+        grids = {name: (values[0], values[-1]) for name, values in grids.items() if name.endswith("_factors")}
     found = []
-    for state in params.state_factors:
-        for entry in params.input_factors:
+    for state in grids["state_factors"]:
+        for entry in grids["input_factors"]:
             plant = mismatched(session, state, entry)
             found.append(Condition("model", f"{state:g}", f"{entry:g}", session, plant))
-    for disturbance in params.disturbance_factors:
-        for noise in params.noise_factors:
+    for disturbance in grids["disturbance_factors"]:
+        for noise in grids["noise_factors"]:
             changes = {
                 "disturbance": tuple(disturbance * gain for gain in process.disturbance),
                 "observation_noise": tuple(noise * std for std in process.observation_noise),
             }
             plant = varied(session, process=changes)
             found.append(Condition("noise", f"{disturbance:g}", f"{noise:g}", session, plant))
-    for first in params.set_point_factors:
-        for others in params.set_point_factors:
+    for first in grids["set_point_factors"]:
+        for others in grids["set_point_factors"]:
             factors = [first, *[others] * (len(case.set_point) - 1)]
             target = tuple(factor * value for factor, value in zip(factors, case.set_point, strict=True))
             told = varied(session, case={"set_point": target})

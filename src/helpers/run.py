@@ -13,9 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-# nbformat's validator would build a grammar of international web addresses, two thirds of this program's start, for a check
-# that no notebook asks for. It is optional: where the package is not to be had, that check is left out.
-sys.modules.setdefault("rfc3987_syntax", None)  # type: ignore[arg-type]
+import helpers.quick_start  # noqa: F401  (before nbformat)
 
 import nbformat
 import papermill

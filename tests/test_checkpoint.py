@@ -72,15 +72,10 @@ def assert_equal(found, expected):
 
 
 # The printed variant has several epochs in an iteration, and stops early; so has a trial with the natural gradient no moments.
-LEARNING = [(offline, "printed", "float32"), (budgeted, "improved", "float32")]
-MORE = [
-    (online, "improved", "float64"),
-    (offline, "improved", "float32"),
-    (offline, "improved", "float64"),
-    (online, "improved", "float32"),
-]
-MORE += [(offline, "natural_gradient", "float32"), (frozen, "improved", "float32")]
-LEARNING += [pytest.param(*case, marks=pytest.mark.torture) for case in MORE]
+LEARNING = [(offline, "improved", dtype) for dtype in ("float32", "float64")]
+LEARNING += [(online, "improved", dtype) for dtype in ("float32", "float64")]
+LEARNING += [(offline, "natural_gradient", "float32"), (frozen, "improved", "float32"), (budgeted, "improved", "float32")]
+LEARNING = [(offline, "printed", "float32"), *(pytest.param(*case, marks=pytest.mark.torture) for case in LEARNING)]
 
 
 @pytest.mark.parametrize(("learn", "variant", "dtype"), LEARNING)

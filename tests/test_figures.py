@@ -397,6 +397,7 @@ def test_style_does_not_change_what_was_drawn() -> None:
         pd.testing.assert_frame_equal(figures.drawn_summary(draw()), plain)
 
 
+@pytest.mark.torture
 def test_svg_is_the_same_each_time_and_its_text_is_text(tmp_path: Path) -> None:
     for name in ("one.svg", "two.svg"):
         draw().savefig(tmp_path / name, metadata={"Date": None})

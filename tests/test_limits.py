@@ -60,6 +60,7 @@ def test_every_alternative_has_a_curve_and_spends_no_more_than_its_budget(contes
     assert last[["clone", "mpc"]].tolist() == [0, 0]
 
 
+@pytest.mark.torture
 def test_what_does_not_learn_keeps_its_value_at_every_budget(contest, learned):
     table = equal_budget.at_budgets(equal_budget.curves(learned), contest)
     assert table.columns.tolist() == [0, 12, 24]

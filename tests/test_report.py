@@ -308,10 +308,9 @@ def test_what_went_well_is_said_where_the_limits_were_not_run(results, monkeypat
     assert "It has its price" not in text
 
 
-def test_claims_trials_and_budget_appear_where_they_were_run(several):
-    before = collect(several)
-    trial = next(iter(before.params[1].trials))
-    assert not {"claims", "trials"} & report.tabulate(before).keys()
+def test_claims_trials_and_budget_appear_where_they_were_run(results, several):
+    trial = next(iter(results.params[1].trials))
+    assert not {"claims", "trials"} & report.tabulate(results).keys()
     for seed, case in product(range(6), CASES):
         folder = several / f"smoke/seed_{seed}/case_{case}"
         made = origin("08_claims", case, seed) | {"revision": "abc", "seconds": 1.0}
@@ -367,7 +366,13 @@ MIXTURES = {
 }
 
 
-@pytest.mark.parametrize(("entry", "says"), MIXTURES.values(), ids=MIXTURES)
+FAST = ("a module", "an earlier result", "another seed")
+
+
+@pytest.mark.parametrize(
+    ("entry", "says"),
+    [pytest.param(*case, id=name, marks=() if name in FAST else pytest.mark.torture) for name, case in MIXTURES.items()],
+)
 def test_a_mixture_is_refused_naming_the_result_and_what_changed(own, entry, says):
     path = own / "smoke/seed_0/case_2/offline_improved/record.json"
     whole = json.loads(path.read_text())

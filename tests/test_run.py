@@ -171,6 +171,7 @@ def test_a_damaged_parameter_file_is_marked_for_the_summary_and_the_older_copy_s
     assert not (here / "01.failed").exists()
 
 
+@pytest.mark.torture
 def test_a_missing_result_ends_in_a_sentence_and_keeps_the_executed_copy(here, capfd):
     arguments = [
         "02_offline_irl",
@@ -404,6 +405,7 @@ def test_what_make_bench_wrote_last_goes_into_the_report(finished, name):
     assert finished() == {}
 
 
+@pytest.mark.torture
 @pytest.mark.parametrize(
     ("scale", "says"),
     [

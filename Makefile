@@ -14,9 +14,7 @@ PYTEST = $(BIN)/python -m pytest --numprocesses $(CORES) --dist loadfile --no-lo
 SNAKEMAKE = $(BIN)/python -m snakemake --profile profiles/local --cores $(CORES)
 
 # Tests of numbers: what another processor may round otherwise.
-NUMERICAL := $(addprefix tests/test_,$(addsuffix .py,alternatives attainable cloning control_quality controllers deployment evaluation \
-	experiments features guard identification kalman limits maxent_irl mismatch mpc nonlinear_tank optimiser own_plant plant_model policy \
-	process reinforce rollout stages statistics system_identification))
+NUMERICAL := tests/plant tests/learning tests/evidence tests/own_plant tests/runs/test_stages.py
 
 .PHONY: help setup reports evidence smoke test portable lock lab bench torture cluster publish notebooks clean
 
@@ -83,10 +81,10 @@ cluster: setup  ## as root on Debian: install SLURM, run the smoke scale through
 	$(BIN)/python -m torture.cluster $(if $(ACCOUNTING),--accounting)
 
 publish: setup  ## copy reports/latest to reports/reference
-	$(BIN)/python -m helpers.publish
+	$(BIN)/python -m helpers publish
 
 notebooks: setup  ## run the notebooks at their defaults and store the outputs in them
-	$(BIN)/python -m helpers.refresh
+	$(BIN)/python -m helpers refresh
 
 clean:  ## remove results and the last report
 	rm -rf results reports/latest .snakemake

@@ -1,4 +1,4 @@
-# The order of the stages for each case and seed. Every stage is one notebook, executed by helpers.run.
+# The order of the stages for each case and seed. Every stage is one notebook, executed by helpers.runs.run.
 # Settings (snakemake --config name=value): seeds (how many), scale (smoke or paper), results, reports (folders),
 # evidence=1 for the runs beyond the paper's own (claims, limits, trials of offline learning, inferred settings), and
 # missing=1 for a report of the seeds whose stages are all there.
@@ -13,8 +13,8 @@ from collections import Counter
 from functools import cache
 from pathlib import Path
 
-from helpers.identity import changes, inputs
-from helpers.params import load_trials
+from helpers.runs.identity import changes, inputs
+from helpers.settings.paper import load_trials
 
 ROOT = Path(workflow.basedir)
 SCALE = config.get("scale", "paper")
@@ -33,7 +33,7 @@ BENCHMARKS = [ROOT / "reports/reference/benchmarks" / name for name in ("summary
 FEW = SEEDS[:5]
 CASE = f"{RESULTS}/{SCALE}/seed_{{seed}}/case_{{case}}"
 LOG = f"{RESULTS}/{SCALE}/seed_{{seed}}/case_{{case}}/notebooks"
-RUN = f"{shlex.quote(sys.executable)} -m helpers.run"
+RUN = f"{shlex.quote(sys.executable)} -m helpers run"
 FOLDER = shlex.quote(str(Path(RESULTS).resolve()))
 ROOTS = f"-p scale {SCALE} -p input_root {FOLDER} -p output_root {FOLDER}"
 
@@ -163,7 +163,7 @@ rule transfer:
         f"{RUN} 04_knowledge_transfer {{log:q}} -p case 3 -p seed {{wildcards.seed}} -p variant {{wildcards.variant}} {ROOTS}"
 
 
-# Nothing reads what other variants would learn online, so helpers.run ends notebook 04 after the transfer.
+# Nothing reads what other variants would learn online, so helpers.runs.run ends notebook 04 after the transfer.
 use rule transfer as transfer_alone with:
     output:
         f"{RESULTS}/{SCALE}/seed_{{seed}}/case_3/transfer_{{variant}}/record.json",

@@ -24,7 +24,7 @@ from benchmarks.subjects import (
     scaling,
     scaling_sizes,
 )
-from helpers.artifacts import code_revision
+from helpers.runs.artifacts import code_revision
 
 FLOATS = "%.6g"
 ENOUGH_SECONDS = 75.0  # no further round begins after that long, on a machine that is slow or busy

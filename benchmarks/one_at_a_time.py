@@ -11,19 +11,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from helpers.features import FeatureMap
-from helpers.params import LearnerParams
-from helpers.policy import RELU6_TOP, LSTMPolicy
-from helpers.process import LinearProcess
-from helpers.reinforce import (
-    Reward,
-    baseline_regressors,
-    regression_advantage,
-    surrogate,
-    whole_return_advantage,
-)
-from helpers.task import ControlTask
-from helpers.trajectories import Trajectories
+from helpers.learning.features import FeatureMap
+from helpers.learning.policy import RELU6_TOP, LSTMPolicy
+from helpers.learning.reinforce import Reward, baseline_regressors, regression_advantage, surrogate, whole_return_advantage
+from helpers.plant.process import LinearProcess
+from helpers.plant.task import ControlTask, Trajectories
+from helpers.settings.paper import LearnerParams
 
 
 class StepwisePolicy(nn.Module):
@@ -97,7 +90,7 @@ def weighed(batch: Trajectories, reward: Reward, features: FeatureMap, params: L
 
 
 class OneAtATime:
-    """A learner that draws its episodes one after the other; its attributes are those of `helpers.reinforce.Learner`."""
+    """A learner that draws its episodes one after the other; its attributes are those of `helpers.learning.reinforce.Learner`."""
 
     def __init__(
         self,

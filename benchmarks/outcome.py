@@ -27,9 +27,9 @@ from benchmarks.subjects import (
     SIDE_BY_SIDE,
     Subject,
 )
-from helpers.figures import INK, MUTED, WIDTH
-from helpers.identity import versions
-from helpers.tables import to_markdown
+from helpers.report.figures import INK, MUTED, WIDTH
+from helpers.report.tables import to_markdown
+from helpers.runs.identity import versions
 
 COLUMNS = [
     "what",

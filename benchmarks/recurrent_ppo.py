@@ -7,11 +7,11 @@ import torch
 from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from helpers.gym_environment import TrackingEnv
-from helpers.maxent_irl import initial_weights
-from helpers.params import Params
-from helpers.process import LinearProcess
-from helpers.task import ControlTask
+from helpers.evidence.gym_environment import TrackingEnv
+from helpers.learning.maxent_irl import initial_weights
+from helpers.plant.process import LinearProcess
+from helpers.plant.task import ControlTask
+from helpers.settings.paper import Params
 
 
 class ProcessEnv(TrackingEnv):

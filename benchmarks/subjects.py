@@ -13,14 +13,14 @@ import torch
 
 from benchmarks.one_at_a_time import OneAtATime
 from benchmarks.side_by_side import PROCESSES, SideBySide
-from helpers.features import FeatureMap
-from helpers.maxent_irl import apprentice_reward, initial_weights
-from helpers.params import LearnerParams, Params, load
-from helpers.policy import LSTMPolicy
-from helpers.process import LinearProcess
-from helpers.randomness import stream
-from helpers.reinforce import Learner, Reward
-from helpers.task import ControlTask
+from helpers.learning.features import FeatureMap
+from helpers.learning.maxent_irl import apprentice_reward, initial_weights
+from helpers.learning.policy import LSTMPolicy
+from helpers.learning.reinforce import Learner, Reward
+from helpers.plant.process import LinearProcess
+from helpers.plant.rollout import stream
+from helpers.plant.task import ControlTask
+from helpers.settings.paper import LearnerParams, Params, load
 
 PROJECT = Path(__file__).resolve().parents[1]
 OURS, OURS_AS_SET, ONE_AT_A_TIME = "ours", "ours, with the minibatches of the improved variant", "one episode at a time"

@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from helpers.controllers import PID
-from helpers.features import FeatureMap
-from helpers.params import LearnerParams, Params, load
-from helpers.policy import LSTMPolicy
-from helpers.process import LinearProcess
-from helpers.randomness import stream
-from helpers.reinforce import Learner
-from helpers.task import ControlTask
+from helpers.learning.features import FeatureMap
+from helpers.learning.policy import LSTMPolicy
+from helpers.learning.reinforce import Learner
+from helpers.plant.controllers import PID
+from helpers.plant.process import LinearProcess
+from helpers.plant.rollout import stream
+from helpers.plant.task import ControlTask
+from helpers.settings.paper import LearnerParams, Params, load
 
 torch.set_num_threads(1)
 LONGEST = ("test_notebooks.py", "test_report.py", "test_run.py")

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from helpers.artifacts import RECORD, load_stage
-from helpers.sources import PROJECT
+from helpers.runs.artifacts import RECORD, load_stage
+from helpers.runs.sources import PROJECT
 
 PARTS = ("Snakefile", "params", "profiles", "src/helpers", "notebooks", "reports/template")
 INTERVAL = re.compile(r"checkpoint_interval: \{value: [0-9.]+")

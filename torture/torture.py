@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from helpers.artifacts import code_revision
-from helpers.sources import PROJECT
-from helpers.tables import to_markdown
+from helpers.report.tables import to_markdown
+from helpers.runs.artifacts import code_revision
+from helpers.runs.sources import PROJECT
 from torture.kernels import Parallel, side_by_side
 from torture.kills import Tally, survive, undisturbed
 from torture.runs import Place

@@ -1,0 +1,210 @@
+"""Imitation put to the test: other features, other demonstrators, and cloning, each as a verb like those of `experiments`."""
+
+from dataclasses import dataclass
+
+import pandas as pd
+import torch
+from torch import Tensor
+
+from helpers.evidence.experiments import Prepared, Scores, copied, economical, gap_to, mode, predictive, varied
+from helpers.learning.cloning import clone
+from helpers.learning.evaluation import feature_gap, objective
+from helpers.learning.features import FeatureMap
+from helpers.learning.maxent_irl import initial_weights
+from helpers.learning.policy import LSTMPolicy
+from helpers.plant.controllers import Controller, Operator
+from helpers.plant.rollout import rollout
+from helpers.plant.task import Trajectories
+from helpers.runs import stages
+from helpers.runs.session import Session
+
+# What can be learned from --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SomeFeatures(FeatureMap):
+    """A feature map that keeps only some of the features, by their place in Eq. 4.2.5."""
+
+    kept: tuple[int, ...] = ()
+
+    def state(self, trajectories: Trajectories) -> Tensor:
+        """phi of the kept features at t = 1..T, shape (T, K, number kept)."""
+        return super().state(trajectories)[..., self.kept]
+
+
+def feature_sets(prepared: Prepared) -> Scores:
+    """Algorithm 2 with the Type I features alone (type_one) and with all (all_types), alike in everything else.
+
+    own_gap: the gap in the features that were matched; gap: in all six; distance: between the mean responses of policy and
+    expert, root mean square over time and loops, as a share of the set point change; then the outcome of improving each online
+    alike.
+    """
+    session, params = prepared.session, prepared.params
+    if not prepared.planned(params.feature_sets):
+        return {}
+    short = economical(varied(session, offline={"epochs": params.feature_sets.epochs}))
+    expert = session.features.errors(stages.fresh_trajectories(session, session.expert)).mean(1)
+    truth, scores = prepared.expert_features, Scores()
+    everything = tuple(range(len(truth)))
+    for name, kept in (("type_one", everything[: len(session.task.set_point)]), ("all_types", everything)):
+        policy = _matching(prepared, short, kept)
+        fresh, improved = mode(session, policy), stages.improve(session, copied(session, policy), "x").policy
+        v = session.features.trajectory(fresh).mean(0).double()
+        scores[name] = {
+            "own_gap": feature_gap(v[list(kept)], truth[list(kept)]),
+            "gap": feature_gap(v, truth),
+            "distance": (session.features.errors(fresh).mean(1) - expert).square().mean().sqrt().item(),
+            "objective_after_online": stages.judge(session, mode(session, improved))["objective_x"],
+        }
+    return scores
+
+
+def _matching(prepared: Prepared, session: Session, kept: tuple[int, ...]) -> LSTMPolicy:
+    """The policy that Algorithm 2 learns when it knows these features only."""
+    chosen = SomeFeatures(**vars(session.features), kept=kept)
+    start = initial_weights(session.variant_params.weights, len(session.task.set_point), session.dtype)[list(kept)]
+    return stages.imitate(session, prepared.demonstrations, stages.fresh_policy(session), start, chosen).policy
+
+
+def record(session: Session, controller: Controller, purpose: str) -> stages.Demonstrations:
+    """Demonstrations of another controller in the session's task, as notebook 01 records those of the PID."""
+    scale = session.scale_params
+    trajectories = rollout(session.process, controller, session.task, scale.demonstrations, session.stream("experiments", purpose))
+    truth = stages.judge(session, stages.fresh_trajectories(session, controller, scale.expert_evaluation))
+    return stages.Demonstrations(trajectories, pd.Series(truth))
+
+
+def demonstrators(prepared: Prepared) -> Scores:
+    """Algorithm 2 on the data of a predictive controller, of an operator who intervenes, and of a plant at rest."""
+    if not prepared.planned(prepared.params.demonstrators):
+        return {}
+    return _from_predictive(prepared) | _from_operator(prepared) | _from_rest(prepared)
+
+
+def _learned_from(prepared: Prepared, data: stages.Demonstrations) -> tuple[LSTMPolicy, dict[str, float]]:
+    """The policy that Algorithm 2 learns from such data; its gap to them, and the tracking objective of both."""
+    session = prepared.session
+    short = economical(varied(session, offline={"epochs": prepared.params.demonstrators.epochs}))
+    learned = stages.imitate(short, data, stages.fresh_policy(session)).policy
+    fresh = mode(session, learned)
+    return learned, {
+        "gap": gap_to(session, fresh, data.true_features(session.feature_names).double()),
+        "objective_x": stages.judge(session, fresh)["objective_x"],
+        "objective_x_of_demonstrator": float(data.scores["objective_x"]),
+    }
+
+
+def _from_predictive(prepared: Prepared) -> Scores:
+    _, figures = _learned_from(prepared, record(prepared.session, predictive(prepared), "predictive"))
+    return {"from_predictive": figures}
+
+
+def _from_operator(prepared: Prepared) -> Scores:
+    """How well the interventions are repeated (`miss_by_hand`) by the policies learned from the operator's data through
+    Algorithm 2 and through cloning, and by one learned from the controller's alone."""
+    session, params = prepared.session, prepared.params.demonstrators
+    held = torch.tensor([params.held if name == params.by_hand else torch.nan for name in session.params.process.manipulated])
+    operator = Operator(session.expert, session.task, params.threshold, held.to(session.dtype))
+    data = record(session, operator, "operator")
+    learned, figures = _learned_from(prepared, data)
+    own = stages.fresh_trajectories(session, operator)
+    policies = {"from_operator": learned, "operator_cloned": cloned(prepared, data.trajectories), "from_pid": prepared.imitator}
+    misses = {name: {"miss_by_hand": miss_by_hand(own, operator, policy)} for name, policy in policies.items()}
+    return misses | {"from_operator": figures | misses["from_operator"]}
+
+
+def _from_rest(prepared: Prepared) -> Scores:
+    """Data and simulation both begin at the set point and stay there; the gap is to the controller in the task itself."""
+    session, params = prepared.session, prepared.params.demonstrators
+    spread = tuple(params.rest_std * std for std in session.params.case.initial_std)
+    at_rest = varied(
+        session, case={"initial_mean": session.params.case.set_point, "initial_std": spread}, offline={"epochs": params.epochs}
+    )
+    learned = stages.imitate(economical(at_rest), record(at_rest, at_rest.expert, "at rest"), stages.fresh_policy(session)).policy
+    fresh = mode(session, learned)
+    objective_x = stages.judge(session, fresh)["objective_x"]
+    return {"from_rest": {"gap": gap_to(session, fresh, prepared.expert_features), "objective_x": objective_x}}
+
+
+def miss_by_hand(trajectories: Trajectories, operator: Operator, policy: LSTMPolicy) -> float:
+    """How far a policy's input lies from the operator's under hand control: root mean square, as a share of the input range.
+
+    Given the same recorded past; at the first sample of each spell of hand control only, because later ones show the policy
+    the held input as its own previous one, which any policy could repeat.
+
+    Args:
+        trajectories: the operator's own.
+    """
+    task = operator.task
+    by_hand = operator.by_hand(trajectories.y[:-1])
+    by_hand[1:] &= ~operator.by_hand(trajectories.y[:-2])
+    with torch.no_grad():
+        mean, _ = policy(trajectories.y, trajectories.u, task)
+    miss = (mean - trajectories.u) / (task.input_high - task.input_low)
+    return miss[by_hand].square().mean().sqrt().item()
+
+
+# How robust imitation is ---------------------------------------------------------------------------------------------
+
+
+def conditions(prepared: Prepared) -> dict[str, Session]:
+    """The session as it is, and under conditions that no learning has seen."""
+    session, params = prepared.session, prepared.params.conditions
+    case, process = session.params.case, session.params.process
+    pairs = zip(case.initial_mean, params.initial_shift, case.initial_std, strict=True)
+    shifted = tuple(mean + shift * std for mean, shift, std in pairs)
+    target = tuple(factor * value for factor, value in zip(params.set_point_factor, case.set_point, strict=True))
+    stronger = tuple(params.disturbance_factor * gain for gain in process.disturbance)
+    return {
+        "nominal": session,
+        "initial_state": varied(session, case={"initial_mean": shifted}),
+        "set_point": varied(session, case={"set_point": target}),
+        "disturbance": varied(session, process={"disturbance": stronger}),
+    }
+
+
+def cloned(prepared: Prepared, data: Trajectories) -> LSTMPolicy:
+    """The policy that behavioural cloning learns from such data."""
+    session, params = prepared.session, prepared.params.cloning
+    n_steps, generator = session.epochs(params.steps), session.stream("experiments", "cloning")
+    return clone(stages.fresh_policy(session), data, session.task, params, n_steps, generator).policy
+
+
+def first(demonstrations: stages.Demonstrations, n_trajectories: int) -> stages.Demonstrations:
+    """Only the first of the recorded trajectories."""
+    kept = {name: signal[:, :n_trajectories] for name, signal in vars(demonstrations.trajectories).items()}
+    return stages.Demonstrations(Trajectories(**kept), demonstrations.scores)
+
+
+def robustness(prepared: Prepared) -> Scores:
+    """Imitation through Algorithm 2 and behavioural cloning, each under every condition, from few and many demonstrations.
+
+    gap: to the features that the expert has under the same condition; objective_ratio: the tracking objective as a share of
+    the expert's there. Algorithm 2 has the model of the process besides the data, cloning has the data alone. The improved
+    policy is judged along with them.
+    """
+    session, params = prepared.session, prepared.params
+    if not prepared.planned(params.cloning):
+        return {}
+    policies = {"irl_500": prepared.imitator, "improved": prepared.improved}
+    for number in params.cloning.demonstrations:
+        policies[f"clone_{number}"] = cloned(prepared, first(prepared.demonstrations, number).trajectories)
+    if prepared.planned(params.fewer_demonstrations):
+        short = economical(varied(session, offline={"epochs": params.fewer_demonstrations.epochs}))
+        for number in params.fewer_demonstrations.demonstrations:
+            fewer = first(prepared.demonstrations, number)
+            policies[f"irl_{number}"] = stages.imitate(short, fewer, stages.fresh_policy(session)).policy
+    scores: Scores = {}
+    for condition, run in conditions(prepared).items():
+        expert = stages.fresh_trajectories(run, run.expert)
+        truth = run.features.trajectory(expert).mean(0).double()
+        aim = _objective(prepared, run, expert)
+        for name, policy in policies.items():
+            fresh = mode(run, policy)
+            ratio = _objective(prepared, run, fresh) / aim
+            scores[f"{name}:{condition}"] = {"gap": gap_to(run, fresh, truth), "objective_ratio": ratio}
+    return scores
+
+
+def _objective(prepared: Prepared, session: Session, trajectories: Trajectories) -> float:
+    return objective(trajectories, session.features.on("x"), prepared.params.comparison.beta).mean().item()

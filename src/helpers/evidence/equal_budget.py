@@ -1,0 +1,243 @@
+"""The alternatives at equal budget: each learns on the real objective from the same number of plant episodes.
+
+Every learner gives a curve (the objective of its mode against the plant episodes spent) and its last controller.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import cma
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from helpers.evidence.alternatives import cloned
+from helpers.evidence.experiments import Prepared, copied
+from helpers.evidence.mpc import OffsetFreeMPC
+from helpers.learning.evaluation import objective
+from helpers.learning.policy import LSTMPolicy
+from helpers.learning.reinforce import Learner
+from helpers.plant.controllers import PID, Controller
+from helpers.plant.rollout import rollout
+from helpers.plant.task import Trajectories
+from helpers.runs import stages
+from helpers.runs.session import Session
+from helpers.settings.leaf import InputError
+from helpers.settings.limits import LimitsParams, LimitsScaleParams
+from helpers.settings.paper import GainParams
+
+Build = Callable[[Session], Controller]  # the same controller, told of the set point of that session
+KINDS = ("proportional", "integral", "derivative")
+CURVE = ("learner", "episodes", "objective", "standard_error")
+
+
+class PackageError(InputError):
+    """Packages that a learner needs are not installed."""
+
+
+@dataclass(frozen=True)
+class Contest:
+    """What all learners of one case share: the results of the stages before, the settings, and how much is computed."""
+
+    prepared: Prepared
+    params: LimitsParams
+
+    @property
+    def session(self) -> Session:
+        """The session of the case."""
+        return self.prepared.session
+
+    @property
+    def scale(self) -> LimitsScaleParams:
+        """How much this scale computes."""
+        return self.params.scales[self.session.scale]
+
+    @property
+    def batch(self) -> int:
+        """Plant episodes of an epoch, as online in learning.yaml, fewer at smoke scale."""
+        scale = self.session.scale_params
+        return min(self.session.params.learning.online.episodes, scale.episodes + scale.measured)
+
+    @property
+    def beta(self) -> float:
+        """The sharpness of the real objective."""
+        return self.session.params.case.online.headline_beta
+
+    def sharpness(self, episodes: int, dense: bool) -> float:
+        """Beta of the reward after so many episodes; where `dense`, it begins with the smaller one."""
+        early = episodes < self.params.dense.share * self.scale.episodes
+        return self.params.dense.beta if dense and early else self.beta
+
+    def returns(self, trajectories: Trajectories) -> Tensor:
+        """The real objective of each trajectory on the true state, shape (K,)."""
+        return objective(trajectories, self.session.features.on("x"), self.beta).double()
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A learner's last controller, and its curve: a list of (episodes, objective, standard error)."""
+
+    build: Build
+    curve: list[tuple[int, float, float]]
+
+
+class Visitor:
+    """Judges a controller on the same fresh trajectories each time it is due, and keeps the curve."""
+
+    def __init__(self, contest: Contest) -> None:
+        self.contest = contest
+        self.curve: list[tuple[int, float, float]] = []
+
+    def due(self, episodes: int) -> bool:
+        """Whether so many episodes are a new point of the curve."""
+        return episodes % self.contest.scale.every == 0 and all(episodes != spent for spent, *_ in self.curve)
+
+    def __call__(self, episodes: int, controller: Controller) -> None:
+        """Add a point."""
+        returns = self.contest.returns(stages.fresh_trajectories(self.contest.session, controller, self.contest.scale.judged))
+        self.curve.append((episodes, returns.mean().item(), returns.std().item() / len(returns) ** 0.5))
+
+
+def reinforced(contest: Contest, start: LSTMPolicy, purpose: str, dense: bool) -> Learned:
+    """Algorithm 1 on the real objective with the online settings of learning.yaml, from a given policy."""
+    session, visitor = contest.session, Visitor(contest)
+    online, policy = session.params.learning.online, copied(session, start)
+    n_epochs = -(-contest.scale.episodes // contest.batch)
+    policy.reset_exploration(online.exploration)
+    features = session.features.on("x")
+    generator = session.stream("limits", purpose)
+    learner = Learner(policy, session.process, features, online.learner, contest.batch, n_epochs, generator)
+    memory = stages.memory(session, learner, purpose)
+    if (state := memory.recall()) is None:
+        visitor(0, stages.deploy(session, learner.average))
+    else:
+        learner.restore(state["learner"])
+        visitor.curve = [(int(episodes), *judged) for episodes, *judged in state["curve"]]
+    while learner.epochs < n_epochs:
+        learner.epoch(partial(features.tracking, beta=contest.sharpness(learner.episodes, dense)))
+        if visitor.due(learner.episodes):
+            visitor(learner.episodes, stages.deploy(session, learner.average))
+        memory.keep(lambda: {"learner": learner.state(), "curve": visitor.curve}, finished=learner.epochs == n_epochs)
+    return Learned(partial(_deployed, learner.average), visitor.curve)
+
+
+def _deployed(policy: LSTMPolicy, session: Session) -> Controller:
+    return stages.deploy(session, policy)
+
+
+def retuned(contest: Contest) -> Learned:
+    """The PID with gains tuned by CMA-ES on the real objective, every candidate judged on episodes of its own (Hansen 2016).
+
+    The gains are searched in units of those of the demonstrator and stay positive. The curve is that of the search's mean.
+    """
+    session, params, visitor = contest.session, contest.params.tuning, Visitor(contest)
+    start, generator = session.params.demonstrator, session.stream("limits", "tuning")
+    proportional, integral = np.array(start.proportional), np.array(start.integral)
+    derivative = params.derivative_unit * proportional * session.params.process.sampling_time
+    unit = np.concatenate([proportional, integral, np.maximum(derivative, start.derivative)])
+    first = np.concatenate([proportional, integral, start.derivative]) / unit
+    options = {"bounds": [0, None], "seed": int(torch.randint(1, 2**31, (1,), generator=generator)), "verbose": -9}
+    search = cma.CMAEvolutionStrategy(first, params.initial_step, options)
+
+    def gains(point: np.ndarray) -> GainParams:
+        kinds = np.split(point * unit, 3)
+        return start.model_copy(update={name: tuple(kind.tolist()) for name, kind in zip(KINDS, kinds, strict=True)})
+
+    def pid(found: GainParams, run: Session) -> Controller:
+        return PID(found, run.task.set_point, run.params.process.sampling_time)
+
+    visitor(0, pid(start, session))
+    spent, mean = 0, first
+    while spent + params.episodes * search.popsize <= contest.scale.episodes:
+        points, costs = search.ask(), []
+        for point in points:
+            batch = rollout(session.process, pid(gains(point), session), session.task, params.episodes, generator)
+            costs.append(-contest.returns(batch).mean().item())
+        search.tell(points, costs)
+        before, spent = spent, spent + params.episodes * len(points)
+        mean = np.asarray(search.result.xfavorite)
+        if before // contest.scale.every < spent // contest.scale.every:
+            visitor(spent, pid(gains(mean), session))
+    return Learned(partial(pid, gains(mean)), visitor.curve)
+
+
+def from_library(contest: Contest, name: str) -> Learned:
+    """PPO or RecurrentPPO from scratch; an interrupted run does not repeat one that has ended.
+
+    Raises:
+        PackageError: if the extra `alternatives` is not installed.
+    """
+    try:
+        from helpers.evidence import library_learners as library  # noqa: PLC0415  # of an extra
+    except ImportError as error:
+        raise PackageError(
+            f"params/limits.yaml: key 'scales.{contest.session.scale}.library': {name} needs a package that is not installed "
+            f"({error.name}); run python -m pip install -e '.[alternatives]'"
+        ) from error
+    session, visitor = contest.session, Visitor(contest)
+    params, policy = getattr(contest.params, name), session.params.learning.policy
+    model = library.library_learner(
+        name, session.process, session.task, policy, params, session.features.params.discount, contest.batch, session.seed
+    )
+
+    def build(run: Session) -> Controller:
+        return library.LibraryController(model, run.task, stages.fresh_policy(run).scaling(run.task))
+
+    def visit(episodes: int) -> None:
+        if visitor.due(episodes):
+            visitor(episodes, build(session))
+
+    memory = session.checkpoint("library", name)
+    if (state := memory.recall()) is None:
+        library.learn(model, session.task, contest.scale.episodes, partial(contest.sharpness, dense=True), visit)
+        memory.keep(lambda: {"policy": model.policy.state_dict(), "curve": visitor.curve}, finished=True)
+    else:
+        model.policy.load_state_dict(state["policy"])
+        visitor.curve = [(int(episodes), *judged) for episodes, *judged in state["curve"]]
+    return Learned(build, visitor.curve)
+
+
+def predictive(contest: Contest) -> Learned:
+    """Offset-free MPC, which learns nothing: it has the model of the process instead."""
+    params = contest.params.predictive
+
+    def build(run: Session) -> Controller:
+        nominal = contest.session.process
+        return OffsetFreeMPC(nominal, run.task, params.horizon, params.move_penalty, params.disturbance_std)
+
+    visitor = Visitor(contest)
+    visitor(0, build(contest.session))
+    return Learned(build, visitor.curve)
+
+
+def learn_all(contest: Contest) -> dict[str, Learned]:
+    """Every alternative by name, in the order of the report."""
+    prepared = contest.prepared
+    clone = cloned(prepared, prepared.demonstrations.trajectories)
+    learned = {
+        "irl_reinforce": reinforced(contest, prepared.imitator, "hot", False),
+        "clone_reinforce": reinforced(contest, clone, "cloned", False),
+        "scratch_reinforce": reinforced(contest, stages.fresh_policy(contest.session), "scratch", True),
+        "pid_tuned": retuned(contest),
+        "mpc": predictive(contest),
+    }
+    if contest.scale.library:
+        learned |= {name: from_library(contest, name) for name in ("ppo", "recurrent_ppo")}
+    visitor = Visitor(contest)
+    visitor(0, stages.deploy(contest.session, clone))
+    return {"clone": Learned(partial(_deployed, clone), visitor.curve)} | learned
+
+
+def curves(learned: Mapping[str, Learned]) -> pd.DataFrame:
+    """All curves as one table with the columns of `CURVE`."""
+    rows = [(name, *point) for name, result in learned.items() for point in result.curve]
+    return pd.DataFrame(rows, columns=list(CURVE))
+
+
+def at_budgets(curve: pd.DataFrame, contest: Contest) -> pd.DataFrame:
+    """The objective of each learner at the listed budgets; what does not learn keeps its value."""
+    table = curve.pivot_table(index="learner", columns="episodes", values="objective", sort=False)
+    every = sorted({*table.columns, *contest.scale.listed})
+    return table.reindex(columns=every).ffill(axis=1)[list(contest.scale.listed)]

@@ -1,0 +1,379 @@
+"""The extra runs behind the claims: each verb takes what `prepare` loaded and returns figures of merit by the name of a run.
+
+Every run draws from the same random streams as the stages, so that runs of one seed can be compared with each other. A verb
+whose experiment is not planned for the session's case (params/experiments.yaml) returns nothing.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import pandas as pd
+import torch
+from torch import Tensor
+
+from helpers.learning.evaluation import feature_gap
+from helpers.learning.maxent_irl import apprentice_reward
+from helpers.learning.policy import LSTMPolicy, PolicyController
+from helpers.learning.reinforce import (
+    Learner,
+    TrainingError,
+    baseline_regressors,
+    discounted_return,
+    regression_advantage,
+    reinforce_in_rounds,
+    surrogate,
+)
+from helpers.plant.controllers import Controller, SaturatedLQ
+from helpers.plant.rollout import rollout
+from helpers.plant.task import Trajectories
+from helpers.runs import stages
+from helpers.runs.progress import ProgressBar
+from helpers.runs.session import Session
+from helpers.settings.evidence import ComparisonParams, ExperimentCases, ExperimentParams, load_experiments
+
+Scores = dict[str, dict[str, float]]  # run, metric, value
+
+# Share of the episodes of an epoch, in the learning that only a claim reads. In Case I, seed 0, the gap to the predictive
+# controller was 5.1 % with it and 4.1 % without, to the operator 2.0 and 1.9 %, from data at rest 25 and 26 %.
+ECONOMY = 3 / 8
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A session with what the stages before it made: demonstrations, the imitating policy with its alpha*, the improved one."""
+
+    session: Session
+    params: ExperimentParams
+    demonstrations: stages.Demonstrations
+    imitator: LSTMPolicy
+    weights: Tensor
+    improved: LSTMPolicy
+    curve: pd.DataFrame  # of the online learning that gave the improved policy: its history.csv
+
+    def planned(self, experiment: ExperimentCases) -> bool:
+        """Whether an experiment is to be run in the session's case."""
+        return self.session.case in experiment.cases
+
+    @property
+    def expert_features(self) -> Tensor:
+        """v_E of the demonstrating controller on many fresh trajectories, shape (d,)."""
+        return self.demonstrations.true_features(self.session.feature_names).double()
+
+
+def prepare(session: Session) -> Prepared:
+    """What the experiments start from: the results of notebooks 01 to 04 for the session's case."""
+    transferred = session.params.case.offline.transfer_from is not None
+    kind, made_by = ("transfer", "04_knowledge_transfer") if transferred else ("offline", "02_offline_irl")
+    imitator, weights = stages.load_policy(session, f"{kind}_improved", made_by)
+    online = session.load("online_improved", made_by if transferred else "03_online_improvement")
+    return Prepared(
+        session=session,
+        params=load_experiments(session.params_root, session.params),
+        demonstrations=stages.load_demonstrations(session),
+        imitator=imitator,
+        weights=weights,
+        improved=online.policy(session.params.learning, session.task),
+        curve=online.table("history.csv", ("epochs", "episodes", "mean_return")),
+    )
+
+
+def plan(prepared: Prepared) -> pd.DataFrame:
+    """Which experiments are planned for which cases, and whether they are run in this one."""
+    planned = {name: entry for name, entry in vars(prepared.params).items() if isinstance(entry, ExperimentCases)}
+    rows = [(name.replace("_", " "), str(list(entry.cases)), prepared.planned(entry)) for name, entry in planned.items()]
+    return pd.DataFrame(rows, columns=["experiment", "cases", "run here"])
+
+
+def varied(session: Session, **changes: Mapping[str, Any]) -> Session:
+    """The session with entries of its parameters replaced: `case`, `offline`, `online`, `process` or `features`."""
+    params = session.params
+    case = params.case.model_copy(update=dict(changes.get("case", {})))
+    for half in ("offline", "online"):
+        case = case.model_copy(update={half: getattr(case, half).model_copy(update=dict(changes.get(half, {})))})
+    return replace(
+        session,
+        params=replace(
+            params,
+            case=case,
+            process=params.process.model_copy(update=dict(changes.get("process", {}))),
+            features=params.features.model_copy(update=dict(changes.get("features", {}))),
+        ),
+    )
+
+
+def economical(session: Session) -> Session:
+    """The session with fewer episodes an epoch, learned from and measured, for runs that nothing but a claim reads."""
+    scale = session.scale_params
+    fewer = {name: max(2, round(ECONOMY * getattr(scale, name))) for name in ("episodes", "measured")}
+    return replace(session, scale_params=scale.model_copy(update=fewer))
+
+
+def mode(session: Session, policy: LSTMPolicy) -> Trajectories:
+    """Fresh trajectories of a policy's mode in the session's task."""
+    return stages.fresh_trajectories(session, stages.deploy(session, policy))
+
+
+def gap_to(session: Session, trajectories: Trajectories, expert_features: Tensor) -> float:
+    """The feature gap of trajectories to the features of an expert, shape (d,)."""
+    return feature_gap(session.features.trajectory(trajectories).mean(0).double(), expert_features)
+
+
+def copied(session: Session, policy: LSTMPolicy) -> LSTMPolicy:
+    """A policy of the same parameters that may be trained further."""
+    copied = stages.fresh_policy(session)
+    copied.load_state_dict(policy.state_dict())
+    return copied
+
+
+# How controllers respond ---------------------------------------------------------------------------------------------
+
+
+def response_figures(session: Session, trajectories: Trajectories, comparison: ComparisonParams) -> dict[str, float]:
+    """Figures of the response that `judge` lacks, and two of its own in a form that is always a number.
+
+    rise_time is that of `judge`, or the whole episode where the mean response never gets there; settling_time, after which it
+    stays within a band about the set point; abs_offset, the size of the mean error at the end; excess_travel, how much further
+    the mean response travels than from its start to its end, as a share of the set point change (nought without overshoot and
+    oscillation, up to noise); tail_error, the mean |e| over both loops at the end.
+    """
+    figures = stages.judge(session, trajectories)
+    error = session.features.errors(trajectories)
+    mean = error.mean(1)
+    outside = (mean.abs() > comparison.band) * torch.arange(1, len(mean) + 1, dtype=mean.dtype)[:, None]
+    settled = outside.amax(0) * session.params.process.sampling_time
+    travel = mean.diff(dim=0).abs().sum(0) - (mean[-1] - mean[0]).abs()
+    episode = session.task.n_steps * session.params.process.sampling_time
+    tail = error[-comparison.n_last :]
+    rows = {"objective_x": figures["objective_x"], "tail_error": tail.abs().mean().item()}
+    loops, of_loops = session.params.process.controlled, torch.stack([settled, tail.mean((0, 1)).abs(), travel], dim=1)
+    for loop, (settling, offset, extra) in zip(loops, of_loops.tolist(), strict=True):
+        rise = figures[f"rise_time:{loop}"]
+        rows[f"rise_time:{loop}"] = episode if math.isnan(rise) else rise
+        rows[f"settling_time:{loop}"] = settling
+        rows[f"abs_offset:{loop}"] = offset
+        rows[f"overshoot:{loop}"] = figures[f"overshoot:{loop}"]
+        rows[f"excess_travel:{loop}"] = extra
+    return rows
+
+
+def predictive(prepared: Prepared) -> SaturatedLQ:
+    """The predictive controller of the session's task."""
+    session, params = prepared.session, prepared.params.demonstrators
+    return SaturatedLQ(session.process.state_step, session.process.input_step, session.task, params.horizon, params.move_penalty)
+
+
+def responses(prepared: Prepared) -> Scores:
+    """How expert, imitating policy, improved policy and predictive controller respond to the same disturbances."""
+    session = prepared.session
+    controllers: dict[str, Controller] = {
+        "expert": session.expert,
+        "offline": stages.deploy(session, prepared.imitator),
+        "online": stages.deploy(session, prepared.improved),
+        "predictive": predictive(prepared),
+    }
+    comparison = prepared.params.comparison
+    return {
+        name: response_figures(session, stages.fresh_trajectories(session, controller), comparison)
+        for name, controller in controllers.items()
+    }
+
+
+def readings(prepared: Prepared) -> Scores:
+    """What can be read off model, data and weights without learning.
+
+    loop_share of each loop: the share of alpha* in the 1-norm. pulled: how far reaching the other loop's set point by its own
+    input moves a loop at rest, as a share of the loop's own set point change (from Eq. 4.1.3b; negative: away). never_reached:
+    the share of demonstrations whose true state never gets to the set point in a loop.
+    """
+    session = prepared.session
+    loops = session.params.process.controlled
+    share = prepared.weights.abs().reshape(-1, len(loops)).sum(0) / prepared.weights.abs().sum()
+    drift, target = session.process.drift_state, session.task.set_point
+    change = -(drift - drift.diagonal().diag()) @ target / drift.diagonal() / target
+    short = (session.features.on("x").errors(prepared.demonstrations.trajectories) > 0).all(0).double().mean(0)
+    rows = {
+        f"{name}:{loop}": value
+        for name, values in (("loop_share", share), ("pulled", change), ("never_reached", short))
+        for loop, value in zip(loops, values.tolist(), strict=True)
+    }
+    return {"readings": rows}
+
+
+# How learning goes ---------------------------------------------------------------------------------------------------
+
+
+def first_epoch(epochs: Sequence[int], values: Sequence[float], level: float) -> int:
+    """The first epoch whose value reaches a level from below; one more than the last where none does."""
+    return next((epoch for epoch, value in zip(epochs, values, strict=True) if value >= level), epochs[-1] + 1)
+
+
+def attempt(session: Session, start: LSTMPolicy, betas: Sequence[float]) -> tuple[LSTMPolicy, pd.DataFrame]:
+    """Online learning with these betas, one a round: the policy and its curve.
+
+    Where the reward is so sparse that every episode of a batch earns the same, learning cannot go on: the policy stays as it
+    was at the start, and the curve is empty.
+    """
+    try:
+        result = stages.improve(varied(session, online={"beta": tuple(betas)}), copied(session, start), "x")
+    except TrainingError:
+        return start, pd.DataFrame({"epochs": [], "episodes": [], "mean_return": []})
+    return result.policy, stages.history_table(result.records, session.feature_names)
+
+
+def from_imitator(prepared: Prepared, betas: Sequence[float]) -> tuple[LSTMPolicy, pd.DataFrame]:
+    """`attempt` from the imitating policy. With the case's own betas that is the run of notebook 03 or 04: it is not repeated."""
+    if tuple(betas) == prepared.session.params.case.online.beta:
+        return prepared.improved, prepared.curve
+    return attempt(prepared.session, prepared.imitator, betas)
+
+
+def online_starts(prepared: Prepared) -> tuple[Scores, pd.DataFrame]:
+    """Online learning from the imitating policy (hot) and from an untrained one (scratch), and the curves.
+
+    Same epochs, rate, disturbances and beta. scratch_dense begins with the smaller beta of the offline features, which gives
+    learning from scratch a reward it can find, and has the headline beta in the later rounds only. learned: 1 where learning
+    could go on. epochs_to_level: when the return first reaches what learning from scratch (the better of both) ends with.
+    """
+    session, comparison = prepared.session, prepared.params.comparison
+    rounds = session.params.case.online.epochs
+    sharp = [comparison.beta] * len(rounds)
+    dense = [session.features.params.beta, *sharp[1:]]
+    untrained = stages.fresh_policy(session)
+    results = {
+        "hot": from_imitator(prepared, sharp),
+        "scratch": attempt(session, untrained, sharp),
+        "scratch_dense": attempt(session, untrained, dense),
+    }
+    budget = float(sum(session.epochs(n_epochs) for n_epochs in rounds))
+    level = max(_last(results[name][1]) for name in ("scratch", "scratch_dense"))
+    scores = {}
+    for name, (policy, curve) in results.items():
+        reached = first_epoch(curve["epochs"].tolist(), curve["mean_return"].tolist(), level) if name == "hot" else budget
+        figures = response_figures(session, mode(session, policy), comparison)
+        scores[name] = figures | {"learned": float(len(curve) > 0), "epochs_to_level": float(reached), "epochs": budget}
+    return scores, pd.concat([curve.assign(run=name) for name, (_, curve) in results.items()], ignore_index=True)
+
+
+def _last(curve: pd.DataFrame) -> float:
+    return curve["mean_return"].iloc[-1] if len(curve) else 0.0
+
+
+def sharpness(prepared: Prepared) -> Scores:
+    """Online learning at several beta from the imitating policy, and at the first and last from scratch too, judged alike."""
+    session, params = prepared.session, prepared.params
+    if not prepared.planned(params.beta):
+        return {}
+    betas, n_rounds = params.beta.betas, len(session.params.case.online.epochs)
+    untrained = stages.fresh_policy(session)
+    runs = {f"hot_beta_{beta:g}": from_imitator(prepared, [beta] * n_rounds) for beta in betas}
+    runs |= {f"scratch_beta_{beta:g}": attempt(session, untrained, [beta] * n_rounds) for beta in (betas[0], betas[-1])}
+    scores = {}
+    for name, (policy, curve) in runs.items():
+        figures = response_figures(session, mode(session, policy), params.comparison)
+        scores[name] = figures | {"learned": float(len(curve) > 0)}
+    return scores
+
+
+def online_budget(prepared: Prepared) -> pd.DataFrame:
+    """The objective that online learning ends with, by the plant's episodes in each epoch; epochs and betas are the case's.
+
+    With the episodes of learning.yaml that is the run of notebook 03 or 04, which is not repeated.
+    """
+    session, params = prepared.session, prepared.params.budget
+    rows = []
+    for number in params.episodes if prepared.planned(params) else ():
+        if number == session.params.learning.online.episodes:
+            policy, episodes = prepared.improved, int(prepared.curve["episodes"].iloc[-1])
+        else:
+            result = stages.improve(session, copied(session, prepared.imitator), "x", number)
+            policy, episodes = result.policy, result.records[-1].episodes
+        rows.append((number, episodes, stages.judge(session, mode(session, policy))["objective"]))
+    return pd.DataFrame(rows, columns=["episodes_per_epoch", "episodes", "objective"])
+
+
+def transfer(prepared: Prepared) -> Scores:
+    """Epochs that transfer and learning from scratch need to the least gap that learning from scratch gets to.
+
+    The gap is the running mean over five iterations of the one measured while learning.
+    """
+    session = prepared.session
+    if session.params.case.offline.transfer_from is None:
+        return {}
+    made_by = {"transfer": "04_knowledge_transfer", "offline": "02_offline_irl"}
+    histories = {kind: session.load(f"{kind}_improved", notebook).table("history.csv") for kind, notebook in made_by.items()}
+    smooth = {kind: history["feature_gap"].rolling(5, min_periods=1).mean() for kind, history in histories.items()}
+    least = smooth["offline"].min()
+    epochs = {kind: float(first_epoch(histories[kind]["epochs"].tolist(), (-gap).tolist(), -least)) for kind, gap in smooth.items()}
+    return {"transfer": {"epochs_to_level": epochs["transfer"]}, "from_scratch": {"epochs_to_level": epochs["offline"]}}
+
+
+def learn_under(session: Session, weights: Tensor, n_epochs: int, label: str) -> LSTMPolicy:
+    """Algorithm 1 from an untrained policy under a reward whose weights stay as they are."""
+    generator, params = session.stream("experiments", "frozen"), session.variant_params.learner
+    n_episodes = economical(session).scale_params.episodes
+    policy = stages.fresh_policy(session)
+    learner = Learner(policy, session.process, session.features, params, n_episodes, n_epochs, generator)
+    reward = partial(apprentice_reward, features=session.features, weights=weights)
+    reinforce_in_rounds(learner, [(n_epochs, reward)], ProgressBar(n_epochs, label), stages.memory(session, learner, weights))
+    return learner.average
+
+
+def frozen_weights(prepared: Prepared) -> Scores:
+    """A policy from scratch under weights that stay as they are: does alpha* by itself lead to the expert's behaviour?
+
+    frozen: under our alpha*; frozen_published: under the paper's; frozen_undiscounted: ours, learned with gamma = 1. Beside the
+    response and the gap: alpha . v of the policy and of the expert, and the policy's without discount.
+    """
+    session, params, scores = prepared.session, prepared.params, Scores()
+    if not prepared.planned(params.frozen_weights):
+        return scores
+    runs = {"frozen": (session, prepared.weights)}
+    if session.published is not None:
+        runs["frozen_published"] = (session, torch.tensor(session.published.alpha, dtype=session.dtype))
+    if prepared.planned(params.undiscounted):
+        runs["frozen_undiscounted"] = (varied(session, features={"discount": 1.0}), prepared.weights)
+    expert, gamma = stages.fresh_trajectories(session, session.expert), session.features.params.discount
+    for name, (run, weights) in runs.items():
+        fresh = mode(session, learn_under(run, weights, session.epochs(params.frozen_weights.epochs), name))
+        rewards, of_expert = (apprentice_reward(batch, session.features, weights) for batch in (fresh, expert))
+        scores[name] = response_figures(session, fresh, params.comparison) | {
+            "gap": gap_to(session, fresh, prepared.expert_features),
+            "return": discounted_return(rewards, gamma).mean().item(),
+            "return_undiscounted": rewards.sum(0).mean().item(),
+            "return_of_expert": discounted_return(of_expert, gamma).mean().item(),
+        }
+    return scores
+
+
+def gradient_spread(prepared: Prepared) -> Scores:
+    """The variance of the policy gradient (the trace of its covariance over batches) with and without a baseline.
+
+    Of the imitating policy, exploring, under the tracking reward. none: the whole return; mean: less the mean return, as in
+    Algorithm 1; regression: reward-to-go less a regression, as in the improved variant. Each in units of the first.
+    """
+    session, params = prepared.session, prepared.params.baseline
+    if not prepared.planned(params):
+        return {}
+    policy, generator = copied(session, prepared.imitator), session.stream("experiments", "baseline")
+    policy.reset_exploration()
+    gamma, beta = session.features.params.discount, prepared.params.comparison.beta
+    gradients: dict[str, list[Tensor]] = {"none": [], "mean": [], "regression": []}
+    controller = PolicyController(policy, session.task, exploring=True)
+    for _ in range(max(2, session.epochs(params.batches))):  # as the epochs, fewer at smoke scale
+        batch = rollout(session.process, controller, session.task, params.episodes, generator)
+        rewards = session.features.tracking(batch, beta)
+        returns = discounted_return(rewards, gamma)
+        weights = {
+            "none": returns.expand_as(rewards),
+            "mean": (returns - returns.mean()).expand_as(rewards),
+            "regression": regression_advantage(rewards, gamma, 1.0, baseline_regressors(batch, session.features)),
+        }
+        for name, weight in weights.items():
+            log_probability = policy.log_probability(batch.y, batch.u, batch.command, session.task)
+            slopes = torch.autograd.grad(surrogate(log_probability, weight), list(policy.parameters()))
+            gradients[name].append(torch.cat([slope.flatten() for slope in slopes]))
+    variance = {name: torch.stack(found).var(0).sum().item() for name, found in gradients.items()}
+    return {"gradient": {f"variance:{name}": value / variance["none"] for name, value in variance.items()}}

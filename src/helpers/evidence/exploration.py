@@ -1,0 +1,82 @@
+"""The price of exploring: what every episode of online learning earned, beside the PID under the same disturbances."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from helpers.evidence.equal_budget import Contest
+from helpers.evidence.experiments import copied
+from helpers.learning.policy import LSTMPolicy
+from helpers.learning.reinforce import Learner
+from helpers.plant.rollout import rollout
+from helpers.plant.task import Trajectories
+from helpers.runs import stages
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A reward that keeps the real objective of every exploring episode it is asked about."""
+
+    contest: Contest
+    beta: float
+    seen: list[Tensor]
+
+    def __call__(self, batch: Trajectories) -> Tensor:
+        """The rewards R_1..R_T with this beta, shape (T, K)."""
+        self.seen.append(self.contest.returns(batch))
+        return self.contest.session.features.on("x").tracking(batch, self.beta)
+
+
+def exploring_episodes(contest: Contest) -> pd.DataFrame:
+    """Every exploring episode of the case's online epochs, from the imitating policy (hot) and from an untrained one (scratch).
+
+    Beside each the episode that the PID would have had from the same initial state under the same disturbances. From scratch the
+    first round has the smaller beta of `dense`, without which there is nothing to learn from; all are judged by the real
+    objective. Columns: run, epoch, episode, objective, expert.
+    """
+    online = contest.session.params.case.online
+    starts = {
+        "hot": (contest.prepared.imitator, online.beta),
+        "scratch": (stages.fresh_policy(contest.session), (contest.params.dense.beta, *online.beta[1:])),
+    }
+    return pd.concat([_explore(contest, name, *start) for name, start in starts.items()], ignore_index=True)
+
+
+def _explore(contest: Contest, run: str, start: LSTMPolicy, betas: tuple[float, ...]) -> pd.DataFrame:
+    session = contest.session
+    online, generator = session.params.learning.online, session.stream("limits", "safety")
+    epochs = [session.epochs(n_epochs) for n_epochs in session.params.case.online.epochs]
+    policy = copied(session, start)
+    policy.reset_exploration(online.exploration)
+    features = session.features.on("x")
+    learner = Learner(policy, session.process, features, online.learner, contest.batch, sum(epochs), generator)
+    frames = []
+    for n_epochs, beta in zip(epochs, betas, strict=True):
+        for _ in range(n_epochs):
+            twin = torch.Generator().set_state(generator.get_state())
+            reward = Watched(contest, beta, [])
+            learner.epoch(reward)
+            paired = contest.returns(rollout(session.process, session.expert, session.task, contest.batch, twin))
+            columns = {"run": run, "epoch": learner.epochs, "objective": reward.seen[0].numpy(), "expert": paired.numpy()}
+            frames.append(pd.DataFrame(columns))
+    episodes = pd.concat(frames, ignore_index=True)
+    return episodes.assign(episode=np.arange(1, len(episodes) + 1))[["run", "epoch", "episode", "objective", "expert"]]
+
+
+def safety(episodes: pd.DataFrame) -> pd.DataFrame:
+    """The price of exploring: a row for each run.
+
+    worst: the least objective of an episode, worst_expert: the PID's on the same draws; worse: the share of episodes worse than
+    the PID's; regret: the sum of what they earned less than the PID (negative: more), regret_peak: the greatest sum on the way,
+    regret_episodes: the sum in mean episodes of the PID.
+    """
+    rows = []
+    for run, group in episodes.groupby("run", sort=False):
+        lost = group["expert"] - group["objective"]
+        row = {"run": run, "episodes": len(group), "worst": group["objective"].min(), "worst_expert": group["expert"].min()}
+        row |= {"worse": (lost > 0).mean(), "regret": lost.sum(), "regret_episodes": lost.sum() / group["expert"].mean()}
+        rows.append(row | {"regret_peak": lost.cumsum().max()})
+    return pd.DataFrame(rows)

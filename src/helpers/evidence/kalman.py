@@ -1,0 +1,68 @@
+"""Filters in front of a controller: what the observation noise costs, and what a predictive controller corrects its model by."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from helpers.plant.controllers import Controller
+from helpers.plant.process import LinearProcess
+from helpers.plant.task import ControlTask
+
+
+@dataclass(frozen=True)
+class FilterMemory:
+    """The state as expected before its observation, and the memory of the controller behind the filter.
+
+    Attributes:
+        mean, covariance: of x_t given y_0..y_(t-1), shapes (K, n_x) and (K, n_x, n_x).
+    """
+
+    mean: Tensor
+    covariance: Tensor
+    inner: Any
+
+
+class Filtered:
+    """A controller that acts on a Kalman filter's estimate of the state in place of the observation.
+
+    Process and observation noise grow with the state, so their variances are taken from its expected square: among the filters
+    that are linear in the observations this has the least mean square error (De Koning 1984). It knows the process and where
+    episodes start.
+    """
+
+    def __init__(self, controller: Controller, process: LinearProcess, task: ControlTask) -> None:
+        self.controller = controller
+        self.task = task
+        self.state_step, self.input_step = process.state_step, process.input_step
+        self.process_variance = process.disturbance_gain**2 * process.sampling_time
+        self.observation_variance = process.observation_noise**2
+
+    def start(self, n_trajectories: int, n_steps: int, generator: torch.Generator) -> FilterMemory:
+        """The distribution of the initial states."""
+        mean = self.task.initial_mean.expand(n_trajectories, -1)
+        covariance = (self.task.initial_std**2).diag().expand(n_trajectories, -1, -1)
+        return FilterMemory(mean, covariance, self.controller.start(n_trajectories, n_steps, generator))
+
+    def act(self, observation: Tensor, memory: FilterMemory) -> tuple[Tensor, FilterMemory]:
+        """Correct by the observation, act on the estimate, and predict the next state."""
+        mean, covariance = self._corrected(observation, memory.mean, memory.covariance)
+        command, inner = self.controller.act(mean, memory.inner)
+        u = command.clamp(self.task.input_low, self.task.input_high)
+        spread = self.process_variance * _second_moment(mean, covariance)
+        predicted = self.state_step @ covariance @ self.state_step.T + spread.diag_embed()
+        return command, FilterMemory(mean @ self.state_step.T + u @ self.input_step.T, predicted, inner)
+
+    def _corrected(self, observation: Tensor, mean: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
+        noise = self.observation_variance * _second_moment(mean, covariance)
+        tiny = torch.finfo(mean.dtype).tiny  # a state known to be nought is observed without noise
+        innovation = covariance + (noise + tiny).diag_embed()
+        gain = torch.linalg.solve(innovation, covariance).mT  # both are symmetric
+        corrected = mean + (gain @ (observation - mean)[..., None])[..., 0]
+        return corrected, covariance - gain @ covariance
+
+
+def _second_moment(mean: Tensor, covariance: Tensor) -> Tensor:
+    """E x_i^2 of each state, shape (K, n_x)."""
+    return mean**2 + covariance.diagonal(dim1=-2, dim2=-1)

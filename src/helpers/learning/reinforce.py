@@ -1,0 +1,374 @@
+"""Algorithm 1: REINFORCE with baseline for the LSTM policy."""
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from helpers.learning.features import FeatureMap, accumulated_error, discounts, normalised_error
+from helpers.learning.lstm import Tape
+from helpers.learning.natural import precondition
+from helpers.learning.optimiser import Adam
+from helpers.learning.policy import LSTMPolicy, PolicyController, entropy, log_density
+from helpers.plant.process import Process
+from helpers.plant.rollout import rollout
+from helpers.plant.task import Trajectories
+from helpers.settings.paper import LearnerParams
+
+BLOCK = 1000  # episodes whose gradient is computed at once: more would only take memory
+FEW = 100  # episodes below which torch's own LSTM is faster than the gradient through time written out: 7 against 17 ms for 50
+Reward = Callable[[Trajectories], Tensor]  # rewards R_1..R_T, shape (T, K)
+
+
+class TrainingError(RuntimeError):
+    """Learning cannot go on; the message names the epoch and the cause."""
+
+
+def discounted_return(rewards: Tensor, gamma: float) -> Tensor:
+    """G of each trajectory, Eq. 3.1.5: sum_t gamma^(t-1) R_t; (T, K) to (K,)."""
+    return discounts(len(rewards), gamma, rewards) @ rewards
+
+
+def reward_to_go(rewards: Tensor, gamma: float, decay: float = 1.0) -> Tensor:
+    """The part of G that u_t can still change, row t = 0..T-1: the sum of gamma^(s-1) decay^(s-1-t) R_s over s > t.
+
+    With decay = 1 it is exact. Below one it counts late rewards less: they hardly depend on u_t but carry all the noise
+    met on the way, so a little bias buys much variance (Schulman et al. 2016, Eq. 16 with a value of zero).
+    """
+    discounted = rewards * discounts(len(rewards), gamma, rewards)[:, None]
+    future = torch.empty_like(discounted)
+    carried = torch.zeros_like(discounted[0])
+    for t in reversed(range(len(rewards))):
+        carried = discounted[t] + decay * carried
+        future[t] = carried
+    return future
+
+
+def whole_return_advantage(rewards: Tensor, gamma: float) -> Tensor:
+    """G^k - b with one scalar baseline, step 2 of Algorithm 1, the same at every step; (T, K) to (T, K)."""
+    value = discounted_return(rewards, gamma)
+    return (value - value.mean()).expand_as(rewards)
+
+
+def regression_advantage(rewards: Tensor, gamma: float, decay: float, regressors: Tensor) -> Tensor:
+    """Reward-to-go less a baseline of its own for each step: a linear regression on what was known before the input.
+
+    A baseline may depend on the past but not on the present input, so the gradient keeps its expectation (notebook 02).
+
+    Args:
+        rewards: R_1..R_T, shape (T, K).
+        regressors: shape (T, K, p); row t was known before u_t was drawn. A constant is added here.
+    """
+    future = reward_to_go(rewards, gamma, decay)
+    design = torch.cat([torch.ones_like(regressors[..., :1]), regressors], dim=-1)
+    ridge = 1e-3 * rewards.shape[1] * torch.eye(design.shape[-1], dtype=design.dtype)
+    coefficients = torch.linalg.solve(design.mT @ design + ridge, design.mT @ future[..., None])
+    return future - (design @ coefficients)[..., 0]
+
+
+def baseline_regressors(trajectories: Trajectories, features: FeatureMap) -> Tensor:
+    """What the per-step baseline may look at: error, its size and square, its integral, the previous input; (T, K, p).
+
+    All come from the observations, so that the same baseline serves on a plant.
+    """
+    task = features.task
+    error = normalised_error(trajectories.y[:-1], task.set_point, task.error_scale)
+    integral = accumulated_error(error, features.sampling_time)
+    previous = torch.cat([torch.zeros_like(trajectories.u[:1]), trajectories.u[:-1]]) / (task.input_high - task.input_low)
+    return torch.cat([error, error.abs(), error**2, integral, previous], dim=-1)
+
+
+def surrogate(log_probability: Tensor, advantage: Tensor) -> Tensor:
+    """The scalar whose gradient is the policy gradient, Eq. 3.2.4: (1/K) sum_k sum_t A_t^k ln pi(u_t^k | ...)."""
+    return (advantage * log_probability).sum(0).mean()
+
+
+def clipped_surrogate(log_probability: Tensor, drawn: Tensor, advantage: Tensor, clip: float) -> Tensor:
+    """The same gradient for a batch drawn a few steps ago: probability ratios, clipped (Schulman et al. 2017, Eq. 7).
+
+    The paper names proximal policy optimisation as an alternative. Where the policy has not moved since the batch was
+    drawn, the gradient is that of `surrogate`.
+
+    Args:
+        log_probability, drawn: ln pi of the commands under the present policy and under the one that drew them, (T, K).
+    """
+    ratio = (log_probability - drawn).exp()
+    return torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage).sum(0).mean()
+
+
+def annealed(start: float, end: float, progress: float) -> float:
+    """A step size that falls from `start` to `end` along half a cosine while `progress` goes from 0 to 1."""
+    return end + (start - end) * (1 + math.cos(math.pi * progress)) / 2
+
+
+@dataclass(frozen=True)
+class EpochRecord:
+    """What one epoch of Algorithm 1 gave, and what learning had cost by its end.
+
+    `mean_return` is that of the exploring policy and `standard_error` its Monte Carlo error; `policy_std` is the mean
+    standard deviation of the policy as a share of the input range.
+    """
+
+    epochs: int
+    episodes: int
+    gradient_steps: int
+    mean_return: float
+    standard_error: float
+    learning_rate: float
+    policy_std: float
+
+
+class Memory(Protocol):
+    """Where a training keeps its state, to go on from there after an interruption; see `checkpoint`."""
+
+    def recall(self) -> dict[str, Any] | None:
+        """The last state kept, if there is one."""
+
+    def keep(self, state: Callable[[], dict[str, Any]], finished: bool = False) -> None:
+        """Keep a state, if it is time to; only then is it asked for."""
+
+
+class NoMemory:
+    """A training that starts anew after an interruption."""
+
+    def recall(self) -> None:
+        """Nothing."""
+
+    def keep(self, state: Callable[[], dict[str, Any]], finished: bool = False) -> None:
+        """Nothing is kept."""
+
+
+class Learner:
+    """A policy under Algorithm 1: its optimiser, the running average of its weights and what learning has cost so far.
+
+    Attributes:
+        policy: the policy that explores and takes the gradient steps.
+        average: the exponential average of its weights, which is what is kept in the end. With an averaging coefficient
+            of zero it equals the policy.
+        epochs, episodes, gradient_steps: counted up as they are spent.
+    """
+
+    def __init__(
+        self,
+        policy: LSTMPolicy,
+        process: Process,
+        features: FeatureMap,
+        params: LearnerParams,
+        n_episodes: int,
+        total_epochs: int,
+        generator: torch.Generator,
+    ) -> None:
+        self.policy = policy
+        self.average = copy.deepcopy(policy)
+        self.process = process
+        self.features = features
+        self.params = params
+        self.n_episodes = n_episodes
+        self.total_epochs = total_epochs
+        self.generator = generator
+        # With the natural gradient, the learning rate is the share of the trust region that a step takes.
+        kind: type[Adam] | type[torch.optim.SGD] = Adam if params.trust_region is None else torch.optim.SGD
+        self.optimiser = kind(policy.parameters(), lr=params.learning_rate_start)
+        self.epochs = self.episodes = self.gradient_steps = 0
+        self._tapes: list[Tape] = []
+
+    def state(self) -> dict[str, Any]:
+        """All that the next epochs depend on beside what the learner was made with; see `restore`."""
+        return {
+            "policy": self.policy.state_dict(),
+            "average": self.average.state_dict(),
+            "optimiser": self.optimiser.state_dict()["state"],
+            "generator": self.generator.get_state(),
+            "spent": [self.epochs, self.episodes, self.gradient_steps],
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from the state of a learner that was made alike: the next epochs are its next ones, to the last bit."""
+        self.policy.load_state_dict(state["policy"])
+        self.average.load_state_dict(state["average"])
+        moments = {int(index): entry for index, entry in state["optimiser"].items()}
+        self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": moments})
+        self.generator.set_state(state["generator"])
+        self.epochs, self.episodes, self.gradient_steps = state["spent"]
+
+    def epoch(self, reward: Reward) -> EpochRecord:
+        """One epoch: roll out, weigh, step. Raises TrainingError if the return or the gradient is not finite."""
+        params, gamma, task = self.params, self.features.params.discount, self.features.task
+        rate = annealed(params.learning_rate_start, params.learning_rate_end, self.epochs / max(1, self.total_epochs - 1))
+        recording = self.n_episodes <= BLOCK
+        controller = PolicyController(self.policy, task, exploring=True, recording=recording, used=self._tapes)
+        batch = rollout(self.process, controller, task, self.n_episodes, self.generator)
+        rewards = reward(batch)
+        returns = discounted_return(rewards, gamma)
+        if params.credit == "whole_return":
+            advantage = whole_return_advantage(rewards, gamma)
+        else:
+            advantage = regression_advantage(rewards, gamma, params.credit_decay, baseline_regressors(batch, self.features))
+        if not torch.isfinite(advantage).all():
+            raise TrainingError(f"epoch {self.epochs + 1}: the return of the policy is not finite")
+        spread = advantage.std()
+        if not spread > 0:
+            raise TrainingError(f"epoch {self.epochs + 1}: every episode earned the same reward, so there is nothing to learn from")
+        advantage = advantage / spread
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        self._tapes = controller.tapes
+        self._ascend(batch, advantage)
+        self.epochs += 1
+        self.episodes += self.n_episodes
+        self._update_average()
+        return EpochRecord(
+            self.epochs,
+            self.episodes,
+            self.gradient_steps,
+            returns.mean().item(),
+            returns.std().item() / self.n_episodes**0.5,
+            rate,
+            self._exploration(batch),
+        )
+
+    def _ascend(self, batch: Trajectories, advantage: Tensor) -> None:
+        """Gradient steps on one batch, minibatch by minibatch, in one pass or more.
+
+        A single step is the plain policy gradient; with more, every step after the first meets a batch that an older
+        policy drew, and the clipped ratio corrects for it.
+        """
+        params = self.params
+        n_steps = params.passes * params.minibatches
+        edges = [self.n_episodes * part // params.minibatches for part in range(params.minibatches + 1)]
+        drawn = None
+        if n_steps > 1:
+            with torch.no_grad():
+                drawn = log_density(batch.command, *self._distribution(batch, slice(0, self.n_episodes), bool(self._tapes)))
+        for step in range(n_steps):
+            first, last = edges[step % params.minibatches], edges[step % params.minibatches + 1]
+            recorded = step == 0 and bool(self._tapes)  # later on the tapes are those of an older policy
+            self.optimiser.zero_grad()
+            for start in range(first, last, BLOCK):
+                rows = slice(start, min(start + BLOCK, last))
+                mean, std = self._distribution(batch, rows, recorded)
+                log_probability = log_density(batch.command[:, rows], mean, std)
+                if drawn is None:
+                    gain = surrogate(log_probability, advantage[:, rows])
+                else:
+                    gain = clipped_surrogate(log_probability, drawn[:, rows], advantage[:, rows], params.ratio_clip)
+                if params.entropy:
+                    gain = gain + params.entropy * entropy(std, self.features.task).sum(0).mean()
+                (-gain * (rows.stop - rows.start) / (last - first)).backward()
+            self._check_gradient()
+            if params.trust_region is not None:
+                precondition(self.policy, batch, self.features.task, params.trust_region)
+            self.optimiser.step()
+            self.gradient_steps += 1
+
+    def _distribution(self, batch: Trajectories, rows: slice, recorded: bool) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the present policy along some episodes."""
+        if not recorded and rows.stop - rows.start < FEW:
+            return self.policy(batch.y[:, rows], batch.u[:, rows], self.features.task)
+        tapes = [tape.part(rows) for tape in self._tapes]
+        return self.policy.unrolled(batch.y[:, rows], batch.u[:, rows], self.features.task, tapes, recorded)
+
+    def _check_gradient(self) -> None:
+        rate = self.optimiser.param_groups[0]["lr"]
+        for name, parameter in self.policy.named_parameters():
+            if parameter.grad is not None and not parameter.grad.isfinite().all():
+                raise TrainingError(f"epoch {self.epochs + 1}: the gradient of {name} is not finite at the learning rate {rate:g}")
+
+    def _exploration(self, batch: Trajectories) -> float:
+        """Standard deviation of the policy as a share of the input range, along one trajectory."""
+        task = self.features.task
+        with torch.no_grad():
+            std = self.policy(batch.y[:, :1], batch.u[:, :1], task)[1]
+        return (std / (task.input_high - task.input_low)).mean().item()
+
+    def _update_average(self) -> None:
+        # The warm-up keeps the untrained first weights from lingering in the average.
+        keep = min(self.params.averaging, self.epochs / (self.epochs + 9)) if self.params.averaging else 0.0
+        with torch.no_grad():
+            for average, current in zip(self.average.parameters(), self.policy.parameters(), strict=True):
+                average.lerp_(current, 1 - keep)
+
+
+def reinforce(
+    learner: Learner,
+    reward: Reward,
+    n_epochs: int,
+    patience: int = 0,
+    report: Callable[[EpochRecord], None] = lambda record: None,
+    earlier: Sequence[EpochRecord] = (),
+    keep: Callable[[Sequence[EpochRecord]], None] = lambda records: None,
+) -> list[EpochRecord]:
+    """Algorithm 1: at most `n_epochs` epochs under one reward; `report` is called with the record of each.
+
+    Early stopping: with `patience` > 0, stops once that many epochs in a row brought no better mean return.
+
+    Args:
+        earlier: records of the first of these epochs, where the learner has been through them already.
+        keep: called with all records after each epoch.
+    """
+    records = list(earlier)
+    while len(records) < n_epochs and not (patience and records and _epochs_since_best(records) >= patience):
+        records.append(learner.epoch(reward))
+        report(records[-1])
+        keep(records)
+    return records
+
+
+def _epochs_since_best(records: Sequence[EpochRecord]) -> int:
+    """How many epochs ago the mean return was best; of equals the last counts."""
+    best = max(range(len(records)), key=lambda index: (records[index].mean_return, index))
+    return len(records) - 1 - best
+
+
+def improve_online(
+    learner: Learner,
+    epochs: Sequence[int],
+    betas: Sequence[float],
+    report: Callable[[EpochRecord], None] = lambda record: None,
+    memory: Memory | None = None,
+) -> list[EpochRecord]:
+    """Online learning, Section 5.1.2: rounds of Algorithm 1 under the tracking objective, each with its own beta."""
+    rewards = [partial(learner.features.tracking, beta=beta) for beta in betas]
+    return reinforce_in_rounds(learner, list(zip(epochs, rewards, strict=True)), report, memory)
+
+
+def reinforce_in_rounds(
+    learner: Learner,
+    rounds: Sequence[tuple[int, Reward]],
+    report: Callable[[EpochRecord], None] = lambda record: None,
+    memory: Memory | None = None,
+) -> list[EpochRecord]:
+    """Rounds of Algorithm 1, each of so many epochs under a reward of its own.
+
+    With a memory it goes on where an interrupted run was.
+    """
+    memory = memory or NoMemory()
+    finished: list[EpochRecord] = []  # records of earlier rounds
+    started: list[EpochRecord] = []  # and of the interrupted one
+    first = 0
+    if (state := memory.recall()) is not None:
+        learner.restore(state["learner"])
+        first = state["round"]
+        finished, started = ([EpochRecord(**row) for row in state[name]] for name in ("finished", "started"))
+
+    def state_of(index: int, records: Sequence[EpochRecord]) -> dict[str, Any]:
+        return {
+            "learner": learner.state(),
+            "round": index,
+            "finished": [asdict(record) for record in finished],
+            "started": [asdict(record) for record in records],
+        }
+
+    def keep(index: int, records: Sequence[EpochRecord]) -> None:
+        memory.keep(partial(state_of, index, records))
+
+    for index, (n_epochs, reward) in list(enumerate(rounds))[first:]:
+        finished += reinforce(learner, reward, n_epochs, learner.params.patience, report, started, partial(keep, index))
+        started = []
+    memory.keep(partial(state_of, len(rounds), []), finished=True)
+    return finished

@@ -1,0 +1,63 @@
+"""A guarded policy stepped sample by sample on whatever stands for the plant, as it would be on the plant itself."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+import pandas as pd
+import torch
+
+from helpers.own_plant.description import Variable
+from helpers.own_plant.guard import Guard
+from helpers.plant.process import Process
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What happens when, in samples: the operator hands over, the set points move, a sensor fails for a while.
+
+    Attributes:
+        faulty: which controlled variable fails, by its place.
+    """
+
+    n_samples: int
+    hand_over: int
+    step: int
+    fault: range
+    faulty: int
+
+
+def commission(guard: Guard, process: Process, trial: Trial, generator: torch.Generator) -> tuple[pd.DataFrame, list[float]]:
+    """Run a trial from the steady state to the set points of the description; engineering units.
+
+    Returns:
+        A row a sample (mode, a column for each variable, `<name>_sp` for the set points), and the seconds that each step took.
+    """
+    description = guard.description
+    steady_y, steady_u = description.steady("controlled"), description.steady("manipulated")
+    target = np.array([variable.set_point for variable in description.controlled])
+    shape = (trial.n_samples, 1)
+    kicks = torch.randn(*shape, process.n_states, generator=generator, dtype=torch.float64)
+    errors = torch.randn(*shape, process.n_outputs, generator=generator, dtype=torch.float64)
+    x, rows, seconds = torch.zeros(1, process.n_states, dtype=torch.float64), [], []
+    for t in range(trial.n_samples):
+        y = (process.observe(x, errors[t])[0] + steady_y).numpy()
+        set_point = target if t >= trial.step else steady_y.numpy()
+        if t in trial.fault:
+            y[trial.faulty] = np.nan
+        begin = perf_counter()
+        if t < trial.hand_over:
+            u = steady_u.numpy()
+            guard.follow(y, set_point, u)
+        else:
+            u = guard.step(y, set_point)
+        seconds.append(perf_counter() - begin)
+        rows.append({"mode": str(guard.mode), **_named(description.controlled, y), **_named(description.manipulated, u)})
+        rows[-1] |= {f"{name}_sp": value for name, value in _named(description.controlled, set_point).items()}
+        x = process.step(x, torch.tensor(u)[None] - steady_u, kicks[t])
+    return pd.DataFrame(rows), seconds
+
+
+def _named(variables: Sequence[Variable], values: np.ndarray) -> Mapping[str, float]:
+    return {variable.name: float(value) for variable, value in zip(variables, values, strict=True)}

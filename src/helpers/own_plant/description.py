@@ -1,0 +1,199 @@
+"""What a historian file holds: one YAML file that names its columns, units, bounds, set points and steady state.
+
+Unlike the parameter files it has no sources and statuses: its author knows the plant.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import torch
+from pydantic import AfterValidator, Field, Strict, model_validator
+from pydantic_core import PydanticCustomError
+from torch import Tensor
+
+from helpers.plant.task import ControlTask
+from helpers.settings.leaf import Count, NotZero, ParameterError, Positive, Real, Record, Text, read_yaml, validate
+
+SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
+RESERVED = ("row", "clock", "run", "automatic", "segment")  # columns that the table of a record has beside those of the tags
+
+
+def _free(tag: str) -> str:
+    if tag in RESERVED:
+        own = {"own": ", ".join(RESERVED)}
+        raise PydanticCustomError("reserved", "expected a tag other than the program's own columns ({own})", own)
+    return tag
+
+
+Tag = Annotated[Text, AfterValidator(_free)]
+
+
+class Variable(Record):
+    """A column of numbers; engineering units. `low` and `high` bound what is possible; `steady_state` is where the plant rests."""
+
+    name: Text
+    description: Annotated[str, Strict()] = ""
+    tag: Tag
+    unit: Text
+    low: Real
+    high: Real
+    steady_state: Real
+
+    @model_validator(mode="after")
+    def _in_range(self) -> Self:
+        if not self.low < self.high:
+            raise PydanticCustomError("range", "'low' must lie below 'high'")
+        if not self.low <= self.steady_state <= self.high:
+            raise PydanticCustomError("range", "'steady_state' lies outside 'low' to 'high'")
+        return self
+
+
+class ControlledVariable(Variable):
+    """A measured variable. `set_point` is y_sp of the task to be learned and `steady_state` y_ss, before the set point moves.
+
+    `error_scale`, y_sp - y_ss otherwise, is needed where the set point does not move.
+    """
+
+    set_point_tag: Tag | None = None
+    set_point: Real
+    error_scale: NotZero | None = None
+
+    @model_validator(mode="after")
+    def _scaled(self) -> Self:
+        if self.error_scale is None and self.set_point == self.steady_state:
+            raise PydanticCustomError("scale", "'set_point' equals 'steady_state', so the error has no scale: give 'error_scale'")
+        return self
+
+    @property
+    def scale(self) -> float:
+        """The denominator of the normalised error, Eq. 4.2.1."""
+        return self.set_point - self.steady_state if self.error_scale is None else self.error_scale
+
+
+class ManipulatedVariable(Variable):
+    """An input between its bounds. `rate` is the greatest move from one sample to the next, if there is one."""
+
+    rate: Positive | None = None
+
+
+class LoopGains(Record):
+    """One PI or PID loop of the plant, parallel form on the error: the fall-back of the guard; time in the file's unit."""
+
+    controlled: Text
+    manipulated: Text
+    proportional: Real
+    integral: Real
+    derivative: Real = 0.0
+
+
+class PlantDescription(Record):
+    """A plant and its historian file; all values in engineering units.
+
+    Attributes:
+        data: CSV or Parquet file, relative to the description. time: its column of time stamps or numbers.
+        sampling_time: in `time_unit`. horizon: T, samples of an episode. episode: a column that changes with every run.
+        mode: a column; only rows where it holds one of `automatic` show the controller at work.
+        plant: what stands for the plant online, `package.module:Class` or `gymnasium:Id`; without it the identified model does.
+        transfer: other set points by name of the controlled variable, which the file has steps to as well; none: no transfer.
+    """
+
+    title: Text
+    data: Text
+    time: Text
+    time_unit: Literal["s", "min", "h"]
+    sampling_time: Positive
+    horizon: Count
+    episode: Text | None = None
+    mode: Text | None = None
+    automatic: tuple[Text, ...] = ("AUTO",)
+    controlled: Annotated[tuple[ControlledVariable, ...], Field(min_length=1)]
+    manipulated: Annotated[tuple[ManipulatedVariable, ...], Field(min_length=1)]
+    pid: tuple[LoopGains, ...] = ()
+    plant: Text | None = None
+    transfer: dict[Text, Real] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        names = [variable.name for variable in (*self.controlled, *self.manipulated)]
+        tags = [tag for tag in self.columns if tag is not None]
+        for kind, words in (("name", names), ("tag", tags)):
+            doubled = next((word for word in words if words.count(word) > 1), None)
+            if doubled is not None:
+                raise PydanticCustomError("double", "the {kind} '{word}' occurs twice", {"kind": kind, "word": doubled})
+        outputs, inputs = ([variable.name for variable in known] for known in (self.controlled, self.manipulated))
+        for loop in self.pid:
+            for key, name, known in (("controlled", loop.controlled, outputs), ("manipulated", loop.manipulated, inputs)):
+                if name not in known:
+                    found: dict[str, Any] = {"key": key, "name": name}
+                    raise PydanticCustomError("pid", "'pid' names the {key} variable '{name}', which is not described", found)
+        for name, value in self.transfer.items():
+            aimed = next((variable for variable in self.controlled if variable.name == name), None)
+            if aimed is None:
+                raise PydanticCustomError("transfer", "'transfer' names '{name}', which is no controlled variable", {"name": name})
+            if not aimed.low <= value <= aimed.high:
+                raise PydanticCustomError("transfer", "'transfer' takes '{name}' outside 'low' to 'high'", {"name": name})
+            if aimed.error_scale is None and value == aimed.steady_state:
+                still = "'transfer' takes '{name}' to its 'steady_state', so the error has no scale: give 'error_scale'"
+                raise PydanticCustomError("transfer", still, {"name": name})
+        return self
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Every column of the file that is used."""
+        numbers = (*(v.tag for v in self.controlled), *(v.tag for v in self.manipulated))
+        return tuple(c for c in (self.time, self.episode, self.mode, *numbers, *self.set_point_tags) if c is not None)
+
+    @property
+    def set_point_tags(self) -> tuple[str, ...]:
+        """The columns of the set points, of those loops that have one."""
+        return tuple(variable.set_point_tag for variable in self.controlled if variable.set_point_tag is not None)
+
+    def steady(self, kind: Literal["controlled", "manipulated"], dtype: torch.dtype = torch.float64) -> Tensor:
+        """y_ss or u_ss in engineering units, shape (n_y,) or (n_u,)."""
+        variables: Sequence[Variable] = self.controlled if kind == "controlled" else self.manipulated
+        return torch.tensor([variable.steady_state for variable in variables], dtype=dtype)
+
+    def task(self, initial_mean: Tensor, initial_std: Tensor, dtype: torch.dtype) -> ControlTask:
+        """The control task in deviation variables from the steady state; the initial state is that of the model."""
+
+        def tensor(values: list[float]) -> Tensor:
+            return torch.tensor(values, dtype=dtype)
+
+        return ControlTask(
+            set_point=tensor([variable.set_point - variable.steady_state for variable in self.controlled]),
+            error_scale=tensor([variable.scale for variable in self.controlled]),
+            initial_mean=initial_mean.to(dtype),
+            initial_std=initial_std.to(dtype),
+            input_low=tensor([variable.low - variable.steady_state for variable in self.manipulated]),
+            input_high=tensor([variable.high - variable.steady_state for variable in self.manipulated]),
+            n_steps=self.horizon,
+        )
+
+    def with_set_points(self, set_points: dict[str, float]) -> "PlantDescription":
+        """The same plant with other set points, by name of the controlled variable: the task of a transfer.
+
+        Raises:
+            ParameterError: if a name is unknown, or a set point is the steady state of a variable without 'error_scale'.
+        """
+        unknown = sorted({*set_points} - {variable.name for variable in self.controlled})
+        if unknown:
+            known = ", ".join(variable.name for variable in self.controlled)
+            raise ParameterError(f"set point of '{unknown[0]}': expected one of {known}")
+        moved = [
+            variable.model_copy(update={"set_point": set_points.get(variable.name, variable.set_point)})
+            for variable in self.controlled
+        ]
+        still = next((variable.name for variable in moved if variable.scale == 0), None)
+        if still is not None:
+            raise ParameterError(f"set point of '{still}': it equals 'steady_state', so the error has no scale: give 'error_scale'")
+        return self.model_copy(update={"controlled": tuple(moved)})
+
+
+def load_description(path: Path) -> PlantDescription:
+    """The description of a plant from its YAML file.
+
+    Raises:
+        ParameterError: in one sentence that names the file and the key.
+    """
+    return validate(PlantDescription, read_yaml(path), path)

@@ -1,0 +1,131 @@
+"""Episodes and stretches out of a clean record: what the policy learns from, and what the model is identified from."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from helpers.own_plant.description import PlantDescription
+from helpers.own_plant.quality import CleanRecords
+from helpers.own_plant.settings import QualityParams
+from helpers.plant.task import Trajectories
+from helpers.settings.leaf import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Consecutive samples without a break, deviation variables: outputs y (n, n_y), inputs u (n, n_u)."""
+
+    y: Array
+    u: Array
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Demonstrations of one task.
+
+    Attributes:
+        trajectories: with y in the place of x, which a plant does not show; the command is the input.
+        before: the inputs one sample before each episode, shape (K, n_u); after a break those of its first sample.
+        starts: the rows of the file where they begin.
+        left_out: how many more began, by the reason why they do not count.
+    """
+
+    trajectories: Trajectories
+    before: torch.Tensor
+    starts: tuple[int, ...]
+    left_out: dict[str, int]
+
+
+def signals(clean: CleanRecords, description: PlantDescription) -> tuple[Array, Array]:
+    """Outputs and inputs of every sample in deviation variables, (N, n_y) and (N, n_u)."""
+    y = clean.table[[variable.tag for variable in description.controlled]].to_numpy() - description.steady("controlled").numpy()
+    u = clean.table[[variable.tag for variable in description.manipulated]].to_numpy() - description.steady("manipulated").numpy()
+    return y, u
+
+
+def stretches(clean: CleanRecords, description: PlantDescription, shortest: int) -> list[Stretch]:
+    """Every stretch of at least `shortest` samples, whoever was in control."""
+    y, u = signals(clean, description)
+    segment = clean.table["segment"].to_numpy()
+    edges = np.flatnonzero(np.diff(segment)) + 1
+    pieces = zip(np.split(segment, edges), np.split(y, edges), np.split(u, edges), strict=True)
+    return [Stretch(outputs, inputs) for number, outputs, inputs in pieces if number[0] >= 0 and len(number) >= shortest]
+
+
+def episodes(clean: CleanRecords, description: PlantDescription, params: QualityParams, dtype: torch.dtype) -> Episodes:
+    """The demonstrations of the description's task: T samples under automatic control after its set point step.
+
+    An episode begins where the set points arrive at those of the task, the loops that move coming from the steady state. Where
+    no loop moves, stretches at the set point are cut into episodes one after the other.
+
+    Raises:
+        InputError: if there are too few.
+    """
+    table, n_steps = clean.table, description.horizon
+    at_task, came_from = _set_points(clean, description, params)
+    moving = any(variable.set_point != variable.steady_state for variable in description.controlled if variable.set_point_tag)
+    segment, automatic = table["segment"].to_numpy(), table["automatic"].to_numpy()
+    counted = np.stack([segment >= 0, automatic, at_task]).astype(np.int64)
+    totals = np.concatenate([np.zeros((3, 1), dtype=np.int64), counted.cumsum(1)], axis=1)
+    length = n_steps + 1
+    last = len(table) - length
+    first = (
+        np.flatnonzero(at_task[1:] & ~at_task[:-1] & came_from[:-1]) + 1
+        if moving
+        else _windows(segment, at_task & automatic, length)
+    )
+    fits = first <= last
+    within = np.where(fits, first, 0)
+    end = np.minimum(within + length, len(table))  # of a record shorter than an episode, which fits nowhere
+    whole, hands_off, held = totals[:, end] - totals[:, within] == length
+    whole &= fits & (segment[within] == segment[end - 1])
+    left_out = {
+        "cut short by a break": int((~whole).sum()),
+        "not in automatic": int((whole & ~hands_off).sum()),
+        "set point moved again": int((whole & hands_off & ~held).sum()),
+    }
+    starts = first[whole & hands_off & held]
+    if len(starts) < params.fewest_episodes:
+        words = ", ".join(f"{number} {reason}" for reason, number in left_out.items())
+        raise InputError(
+            f"{description.data}: {len(starts)} episodes of {n_steps} samples after a step to the set point of the task, expected "
+            f"{params.fewest_episodes} or more; left out: {words}"
+        )
+    y, u = signals(clean, description)
+    index = starts[None, :] + np.arange(length)[:, None]
+    outputs = torch.tensor(y[index], dtype=dtype)
+    inputs = torch.tensor(u[index[:-1]], dtype=dtype)
+    previous = np.maximum(starts - 1, 0)
+    # Before a break the input is not known, or was another: the first of the episode stands for it.
+    before = torch.tensor(u[np.where(segment[previous] == segment[starts], previous, starts)], dtype=dtype)
+    rows = tuple(int(row) for row in table["row"].to_numpy()[starts])
+    return Episodes(Trajectories(outputs, outputs, inputs, inputs), before, rows, left_out)
+
+
+def _set_points(clean: CleanRecords, description: PlantDescription, params: QualityParams) -> tuple[NDArray, NDArray]:
+    """Where all set points are those of the task, and where those of the loops that move are at the steady state."""
+    at_task = np.ones(len(clean.table), dtype=bool)
+    came_from = at_task.copy()
+    for variable in description.controlled:
+        if variable.set_point_tag is None:
+            continue
+        values, band = clean.table[variable.set_point_tag].to_numpy(), params.set_point_band * abs(variable.scale)
+        at_task &= np.abs(values - variable.set_point) <= band
+        came_from &= np.abs(values - variable.steady_state) <= band
+    return at_task, came_from
+
+
+def _windows(segment: NDArray, usable: NDArray, length: int) -> NDArray:
+    """First samples of windows of some length, one after the other, within every usable piece."""
+    pieces = np.where(usable, segment, -1)
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(pieces)) + 1, [len(pieces)]])
+    found = [np.arange(first, last - length + 1, length) for first, last in pairwise(edges) if pieces[first] >= 0]
+    return np.concatenate(found) if found else np.zeros(0, dtype=int)

@@ -1,0 +1,152 @@
+"""What stands between a deployed policy and a plant: limits, bad measurements, the fall-back PID and the switch from manual."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from simple_pid import PID
+
+from helpers.own_plant.deploy import DeployedPolicy
+from helpers.own_plant.description import PlantDescription
+from helpers.settings.leaf import InputError
+
+Array = NDArray[np.float64]
+
+
+class Mode(StrEnum):
+    """Who sets the inputs."""
+
+    MANUAL = "manual"
+    POLICY = "policy"
+    HOLD = "hold"
+    PID = "PID"
+
+
+@dataclass(frozen=True)
+class GuardLimits:
+    """When the guard acts, in samples.
+
+    Attributes:
+        stale: after so many equal measurements of a variable its sensor counts as dead.
+        hold: so long the inputs are held when a measurement is bad; then the PID takes over.
+        healthy: so many good measurements in a row give control back to the policy.
+        fade: in so many samples the offset fades that makes a switch bumpless, to a third.
+    """
+
+    stale: int = 10
+    hold: int = 3
+    healthy: int = 5
+    fade: int = 5
+
+
+@dataclass
+class Guard:
+    """A policy under guard, one sample a call, engineering units.
+
+    In manual it follows what the operator does, so that the policy's memory is warm and the switch is bumpless: the first input is
+    where the operator left it, and the difference to what the policy asks for fades. A measurement that is not a number, lies
+    outside its range or does not change is bad, and so is a set point that is no number; the last one that was a number counts on.
+    While anything is bad the policy's memory stands still and the inputs are held; then the PID loops whose measurement is good
+    take over from where the inputs are, and the others stay held. The inputs never leave their bounds nor move faster than their
+    rate.
+    """
+
+    policy: DeployedPolicy
+    description: PlantDescription
+    limits: GuardLimits = field(default_factory=GuardLimits)
+
+    def __post_init__(self) -> None:
+        controlled, manipulated = self.description.controlled, self.description.manipulated
+        self.low = np.array([variable.low for variable in manipulated])
+        self.high = np.array([variable.high for variable in manipulated])
+        self.rate = np.array([np.inf if variable.rate is None else variable.rate for variable in manipulated])
+        self.possible = np.array([(variable.low, variable.high) for variable in controlled]).T
+        names = [variable.name for variable in controlled], [variable.name for variable in manipulated]
+        self.loops = [(names[0].index(loop.controlled), names[1].index(loop.manipulated), loop) for loop in self.description.pid]
+        used = [loop[1] for loop in self.loops]
+        if len(set(used)) < len(used):
+            raise InputError(f"{self.description.title}: key 'pid': two loops set the same manipulated variable")
+        self.running: dict[int, PID] = {}
+        self.mode = Mode.MANUAL
+        self.u = np.array([variable.steady_state for variable in manipulated])
+        self.offset = np.zeros(len(manipulated))
+        self.set_point = np.full(len(controlled), np.nan)  # the last that was a number
+        self.last = np.full(len(controlled), np.nan)
+        self.repeats = np.zeros(len(controlled), dtype=int)
+        self.n_bad = self.n_good = 0
+        self.policy.reset()
+
+    def follow(self, y: Array, set_point: Array, u: Array) -> None:
+        """A sample in manual: the operator has set `u`; of an input that is no number the last one counts on."""
+        self.mode = Mode.MANUAL
+        self.n_bad = self.n_good = 0
+        self._ask(y, self._look(y) & self._aim(set_point))
+        self.u = np.where(np.isfinite(u), u, self.u).astype(float)
+
+    def step(self, y: Array, set_point: Array) -> Array:
+        """A sample in automatic: the inputs to apply, (n_u,)."""
+        good = self._look(y)
+        wanted = self._ask(y, good & self._aim(set_point))
+        healthy = bool(np.isfinite(wanted).all())
+        self.n_bad, self.n_good = (self.n_bad, self.n_good + 1) if healthy else (self.n_bad + 1, 0)
+        before, self.mode = self.mode, self._next_mode(healthy)
+        if self.mode == Mode.POLICY:
+            self.n_bad = 0  # not before: a sensor that comes and goes would have the inputs held for ever
+            command, fresh = wanted, np.full(len(self.u), before != Mode.POLICY)
+        elif self.mode == Mode.PID:
+            command, fresh = self._pid(y, good & np.isfinite(self.set_point), begins=before != Mode.PID)
+        else:
+            command, fresh = self.u, np.ones(len(self.u), dtype=bool)
+        command = np.where(np.isfinite(command), command, self.u)  # an input that is no number would never become one again
+        # Whoever takes over begins where the inputs are; the difference to what it asks for fades.
+        self.offset = np.where(fresh, self.u - command, self.offset * np.exp(-1 / self.limits.fade))
+        command = command + self.offset
+        moved = np.clip(command, self.u - self.rate, self.u + self.rate)
+        self.u = np.clip(moved, self.low, self.high)
+        return self.u.copy()
+
+    def _next_mode(self, healthy: bool) -> Mode:
+        if healthy:
+            returning = self.mode in (Mode.HOLD, Mode.PID) and self.n_good < self.limits.healthy
+            return self.mode if returning else Mode.POLICY
+        return Mode.HOLD if self.n_bad <= self.limits.hold and self.mode != Mode.PID else Mode.PID
+
+    def _look(self, y: Array) -> NDArray[np.bool_]:
+        """Which measurements are good."""
+        self.repeats = np.where(y == self.last, self.repeats + 1, 0)
+        self.last = np.asarray(y, dtype=float).copy()
+        inside = (y >= self.possible[0]) & (y <= self.possible[1])  # nan is not
+        return inside & (self.repeats < self.limits.stale)
+
+    def _aim(self, set_point: Array) -> NDArray[np.bool_]:
+        """Which set points are numbers; of the others the last one counts on."""
+        given = np.isfinite(set_point)
+        self.set_point = np.where(given, set_point, self.set_point)
+        return given
+
+    def _ask(self, y: Array, good: NDArray[np.bool_]) -> Array:
+        """What the policy would do, (n_u,), nan if anything is bad: its memory does not advance on that."""
+        if not good.all():
+            return np.full(len(self.u), np.nan)
+        return self.policy.step(np.atleast_2d(y).astype(float), self.set_point[None].astype(float), self.u[None])[0]
+
+    def _pid(self, y: Array, good: NDArray[np.bool_], begins: bool) -> tuple[Array, NDArray[np.bool_]]:
+        """The fall-back: loops with a good measurement, every other input stays where it is; and which loops begin now."""
+        if begins:
+            self.running.clear()
+        command, fresh = self.u.copy(), np.ones(len(self.u), dtype=bool)
+        for output, index, loop in self.loops:
+            if not good[output]:
+                self.running.pop(index, None)
+                continue
+            fresh[index] = index not in self.running
+            if fresh[index]:
+                limits = (self.low[index], self.high[index])
+                gains = (loop.proportional, loop.integral, loop.derivative)
+                pid = self.running[index] = PID(*gains, sample_time=None, output_limits=limits, auto_mode=False)
+                pid.set_auto_mode(True, last_output=self.u[index] - loop.proportional * (self.set_point[output] - y[output]))
+            pid = self.running[index]
+            pid.setpoint = self.set_point[output]
+            command[index] = pid(y[output], dt=self.description.sampling_time)
+        return command, fresh

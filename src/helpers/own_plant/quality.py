@@ -1,0 +1,241 @@
+"""What a record of a plant suffers from: found, named with its rows, repaired by a stated rule and counted, or refused."""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from helpers.own_plant.description import PlantDescription
+from helpers.own_plant.records import Finding, PlantDataError, Records, finding, name_rows
+from helpers.own_plant.settings import QualityParams
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+AT_BOUND = 1e-3  # of the range: as near to a bound as a rounded number may lie
+# What a number in the one unit is in the other: the usual mistakes.
+CONVERSIONS = {
+    "degrees Celsius for kelvin": lambda v: v + 273.15,
+    "kelvin for degrees Celsius": lambda v: v - 273.15,
+    "degrees Fahrenheit for degrees Celsius": lambda v: (v - 32) / 1.8,
+    "degrees Fahrenheit for kelvin": lambda v: (v - 32) / 1.8 + 273.15,
+    "a share for per cent": lambda v: v * 100,
+    "per cent for a share": lambda v: v / 100,
+    "a unit a thousand times larger": lambda v: v * 1000,
+    "a unit a thousand times smaller": lambda v: v / 1000,
+}
+
+
+@dataclass(frozen=True)
+class CleanRecords:
+    """A record in equal steps of time.
+
+    Attributes:
+        table: the columns of `Records.table` and `segment`, which counts the stretches without a break; -1 where a row is of no
+            use. `row` is 0 where a sample was put in.
+        findings: everything found, that of the reading included.
+    """
+
+    table: pd.DataFrame
+    findings: tuple[Finding, ...]
+
+    def section(self) -> pd.DataFrame:
+        """The findings as a table, a row each."""
+        frame = pd.DataFrame([asdict(found) for found in self.findings], columns=["check", "column", "count", "rows", "rule"])
+        return frame.assign(rows=[", ".join(map(str, rows)) for rows in frame["rows"]])
+
+
+def examine(records: Records, description: PlantDescription, params: QualityParams) -> CleanRecords:
+    """Look for everything that is wrong with a record and repair what can be repaired.
+
+    Raises:
+        PlantDataError: where no rule can help: another sampling time, another unit, an input that hardly moves.
+    """
+    found = list(records.findings)
+    columns = _regular(records, description, params, found)
+    row, breaks = columns["row"], np.diff(columns["run"], prepend=columns["run"][:1]) != 0
+    valid = np.ones(len(row), dtype=bool)
+    for controlled in description.controlled:
+        values = columns[controlled.tag]
+        _outside(records, controlled.tag, values, (controlled.low, controlled.high), controlled.unit, row, params, found)
+        _frozen(controlled.tag, values, row, params, found)
+        _spikes(controlled.tag, values, breaks, row, params, found)
+        valid &= _fill(controlled.tag, values, breaks, row, params, found, straight=True)
+    for manipulated in description.manipulated:
+        values, span = columns[manipulated.tag], manipulated.high - manipulated.low
+        slack = AT_BOUND * span
+        limits = (manipulated.low - slack, manipulated.high + slack)
+        _outside(records, manipulated.tag, values, limits, manipulated.unit, row, params, found)
+        valid &= _fill(manipulated.tag, values, breaks, row, params, found, straight=False)
+        np.clip(values, manipulated.low, manipulated.high, out=values)
+        at_bound = (values <= manipulated.low + slack) | (values >= manipulated.high - slack)
+        found += finding("input at a bound", manipulated.tag, _rows(row, at_bound), "kept: a controller may saturate")
+    for tag in description.set_point_tags:
+        valid &= _fill(tag, columns[tag], breaks, row, params, found, straight=False)
+        steps = np.flatnonzero((np.abs(np.diff(columns[tag])) > 0) & ~breaks[1:]) + 1
+        found += finding("set point step", tag, row[steps], "kept: an episode may begin here")
+    if description.mode:
+        found += finding(
+            "not in automatic", description.mode, _rows(row, ~columns["automatic"]), "kept for the model, not for episodes"
+        )
+    _excitation(records, description, columns, valid, params)
+    found += finding("of no use", "all", _rows(row, ~valid), "left out: a stretch ends here")
+    starts = valid & (~np.roll(valid, 1) | breaks)
+    starts[0] = valid[0]
+    columns["segment"] = np.where(valid, starts.cumsum() - 1, -1).astype(np.int32)
+    return CleanRecords(pd.DataFrame(columns, copy=False), tuple(found))
+
+
+def _rows(row: NDArray[np.int32], mask: Mask) -> NDArray[np.int32]:
+    """The rows of the file behind some samples, without those that were put in."""
+    rows = row[mask]
+    return rows[rows > 0]
+
+
+def _regular(records: Records, description: PlantDescription, params: QualityParams, found: list[Finding]) -> dict[str, NDArray]:
+    """The columns in equal steps of time: short gaps become missing samples, long ones a new run."""
+    table, path, time = records.table, records.path, description.time
+    row, clock = table["row"].to_numpy(), table["clock"].to_numpy()
+    step = np.diff(clock)
+    typical = float(np.median(step[step > 0.5])) if (step > 0.5).any() else 1.0
+    if abs(typical - 1) > 0.02:
+        raise PlantDataError(
+            f"{path}: column '{time}': rows are {typical * description.sampling_time:g} {description.time_unit} apart, "
+            f"but 'sampling_time' is {description.sampling_time:g} {description.time_unit}"
+        )
+    samples = np.rint(step)
+    keep = np.append(samples > 0, True)  # of rows with the same time the last one counts
+    found += finding("doubled row", time, row[~keep], "the last one kept")
+    row, clock = row[keep], clock[keep]
+    step = np.diff(clock)
+    samples = np.rint(step).astype(np.int64)
+    off = np.abs(step - samples) > params.jitter
+    if off.mean() > params.outside:
+        raise PlantDataError(
+            f"{path}: column '{time}': {100 * off.mean():.0f} % of the rows lie between two samples, the first is "
+            f"{name_rows(row[1:][off][:1])}; export the record at its sampling time"
+        )
+    uneven = (np.abs(step - samples) > 0.01 * np.maximum(samples, 1)) & (samples == 1)
+    found += finding("uneven time", time, row[1:][uneven], "moved to the nearest sample")
+    gap = samples > 1
+    long = samples > params.longest_repair + 1
+    found += finding("short gap", time, row[1:][gap & ~long], f"at most {params.longest_repair} samples put in")
+    found += finding("long gap", time, row[1:][long], "a stretch ends here")
+    place = np.concatenate([[0], np.where(long, 1, samples).cumsum()])
+    length = int(place[-1]) + 1
+    columns: dict[str, NDArray] = {}
+    for name in table:
+        values = table[name].to_numpy()[keep]
+        if name == "clock":
+            continue
+        if name in ("run", "automatic"):
+            columns[name] = values[np.searchsorted(place, np.arange(length), side="right") - 1]
+        else:
+            columns[name] = np.full(length, 0 if name == "row" else np.nan, dtype=values.dtype)
+            columns[name][place] = values
+    late = np.zeros(length, dtype=np.int32)
+    late[place[1:][long]] = 1
+    columns["run"] = columns["run"] + late.cumsum(dtype=np.int32)
+    return columns
+
+
+def _outside(
+    records: Records, tag: str, values: Array, limits: tuple[float, float], unit: str, row: NDArray, params: QualityParams,
+    found: list[Finding],
+) -> None:  # fmt: skip
+    """Values outside their range become missing; where many are, the unit is wrong."""
+    low, high = limits
+    outside = (values < low) | (values > high)
+    share = outside.sum() / max(1, np.isfinite(values).sum())
+    if share > params.outside:
+        typical = float(np.nanmedian(values))
+        guess = next((words for words, convert in CONVERSIONS.items() if low <= convert(typical) <= high), None)
+        hint = f"; it looks like {guess}" if guess and not low <= typical <= high else ""
+        raise PlantDataError(
+            f"{records.path}: column '{tag}': {100 * share:.0f} % of the values lie outside {low:g} to {high:g} {unit} "
+            f"({name_rows(_rows(row, outside))}), their median is {typical:g}{hint}"
+        )
+    found += finding("outside its range", tag, _rows(row, outside), "missing")
+    values[outside] = np.nan
+
+
+def _frozen(tag: str, values: Array, row: NDArray, params: QualityParams, found: list[Finding]) -> None:
+    """A sensor that repeats the very same value for long is frozen: all but the first become missing."""
+    same = np.diff(values, prepend=np.nan) == 0
+    frozen = _long_runs(same, params.frozen - 1)
+    found += finding("frozen sensor", tag, _rows(row, frozen), f"{params.frozen} or more equal values: all but the first missing")
+    values[frozen] = np.nan
+
+
+def _spikes(tag: str, values: Array, breaks: Mask, row: NDArray, params: QualityParams, found: list[Finding]) -> None:
+    """A value far from the median of itself and its two neighbours to each side is a spike (after Hampel's identifier).
+
+    Far is a multiple of the distance that all but a twentieth of the values keep: a plant under way moves more than one at rest.
+    """
+    known = np.flatnonzero(np.isfinite(values))
+    distance = np.abs(values[known] - median_filter(values[known], size=5, mode="nearest"))
+    scale = float(np.quantile(distance, 0.95)) if len(distance) else 0.0
+    spike = known[(distance > params.outlier * scale) & (scale > 0) & ~breaks[known]]
+    found += finding("outlier", tag, row[spike], "missing")
+    values[spike] = np.nan
+
+
+def _fill(tag: str, values: Array, breaks: Mask, row: NDArray, params: QualityParams, found: list[Finding], straight: bool) -> Mask:
+    """Fill short stretches of missing values, measured ones on a straight line, others by the last value; True where one is."""
+    missing = np.isnan(values)
+    if not missing.any():
+        return np.ones(len(values), dtype=bool)
+    short = missing & ~_long_runs(missing, params.longest_repair + 1)
+    known = np.flatnonzero(~missing)
+    inner = short & (np.arange(len(values)) > known[0]) & (np.arange(len(values)) < known[-1])
+    places = np.flatnonzero(inner)
+    before = known[np.searchsorted(known, places) - 1]
+    after = known[np.searchsorted(known, places)]
+    group = breaks.cumsum()
+    same = group[before] == group[after] if straight else group[before] == group[places]
+    places, before, after = places[same], before[same], after[same]
+    share = (places - before) / (after - before) if straight else np.zeros(len(places))
+    values[places] = values[before] + share * (values[after] - values[before])
+    rule = "on a straight line" if straight else "by the last value"
+    found += (
+        [Finding("filled", tag, len(places), tuple(int(r) for r in row[before[:5]]), f"{rule}, from the row before")]
+        if len(places)
+        else []
+    )
+    return ~np.isnan(values)
+
+
+def _long_runs(mask: Mask, least: int) -> Mask:
+    """Where a mask is true for at least `least` samples in a row."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    first, last = edges[::2], edges[1::2]
+    long = last - first >= least
+    change = np.zeros(len(mask) + 1, dtype=np.int32)
+    change[first[long]] += 1
+    change[last[long]] -= 1
+    return change.cumsum()[:-1].astype(bool)
+
+
+def _excitation(
+    records: Records, description: PlantDescription, columns: dict[str, NDArray], valid: Mask, params: QualityParams
+) -> None:
+    """Every input must move, and no two of them as one."""
+    if not valid.any():
+        raise PlantDataError(f"{records.path}: no row is complete")
+    inputs = np.column_stack([columns[variable.tag][valid] for variable in description.manipulated])
+    spans = np.array([variable.high - variable.low for variable in description.manipulated])
+    spread = inputs.std(0) / spans
+    for variable, share in zip(description.manipulated, spread, strict=True):
+        if share < params.least_movement:
+            raise PlantDataError(
+                f"{records.path}: column '{variable.tag}': too little excitation, its standard deviation is {100 * share:.2g} % "
+                f"of its range, so its effect cannot be identified"
+            )
+    correlation = np.abs(np.corrcoef(inputs, rowvar=False)) if inputs.shape[1] > 1 else np.zeros((1, 1))
+    first, second = np.unravel_index(np.argmax(np.triu(correlation, 1)), correlation.shape)
+    if correlation.ndim and np.triu(correlation, 1).max() > params.collinear:
+        one, other = (description.manipulated[index].tag for index in (int(first), int(second)))
+        raise PlantDataError(
+            f"{records.path}: columns '{one}' and '{other}': the inputs move as one, so their effects cannot be told apart"
+        )

@@ -1,0 +1,1 @@
+"""What is shown: figures, tables, verdicts, findings, the report, and their publication. Nothing below imports it."""

@@ -1,0 +1,210 @@
+"""What the stages of all cases and seeds wrote, read and checked, for the report."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import pandas as pd
+
+from helpers.learning.features import feature_names
+from helpers.report import claims, scorecard
+from helpers.runs.artifacts import RECORD, Stage, load_stage
+from helpers.runs.freshness import check
+from helpers.runs.identity import inputs
+from helpers.settings.paper import Params, PublishedCase, load, load_published
+
+DEMONSTRATIONS, ONLINE, BUDGET, EXPERIMENTS = "demonstrations", "online_improved", "online_budget", "experiments"
+OFFLINE = {"offline": "improved", "offline_printed": "printed"}  # stage in seeds.csv and the variant behind it
+REPORT = "05_report"
+INFERRED = "inferred_settings"  # which has no case, and stands with the first seed
+LIMITS = ("attainable", "budget", "quality", "robustness", "safety")  # the parts of notebook 06, the last one written last
+SCRATCH = "offline_improved"  # of a case that starts from another: the same learning without the transfer
+MADE_BY = {"demonstrations": "01", "offline": "02", "online": "03 (04 for the transfer case)", "transfer": "04"}
+
+
+@dataclass(frozen=True)
+class Results:
+    """What the stages of all cases and seeds wrote.
+
+    Attributes:
+        params, published: by case.
+        stages: by case, seed and folder name.
+        seeds: columns case, seed, stage, metric, value. The stages: expert; minimum_variance; offline, online and online_y of
+            the headline variant (offline of a transfer case is after the transfer); offline_printed; offline_scratch (the
+            transfer case learned from nothing). The ratios of `scorecard.relative` are among the rows.
+        made_from: `identity.inputs` of the report itself.
+        missing: of the seeds asked for, those of which a stage is missing, where that is allowed.
+        claims: columns `claims.COLUMNS`; budget: seed, case, episodes_per_epoch, objective; trials: trial, family,
+            description, case, seed, gap. Each is empty where it was not run. inferred: what notebook 00 wrote, if it was run.
+        limits: by case, seed and part of notebook 06, where it was run to its end.
+        beyond: every stage beyond the paper's own runs, those of claims, budget, trials, limits and inferred settings.
+    """
+
+    scale: str
+    params: dict[int, Params]
+    published: dict[int, PublishedCase]
+    stages: dict[tuple[int, int, str], Stage]
+    seeds: pd.DataFrame
+    claims: pd.DataFrame
+    budget: pd.DataFrame
+    trials: pd.DataFrame
+    inferred: Stage | None = None
+    limits: Mapping[tuple[int, int, str], Stage] = field(default_factory=dict)
+    beyond: tuple[Stage, ...] = ()
+    made_from: Mapping[str, str] = field(default_factory=dict)
+    missing: tuple[int, ...] = ()
+
+    @cached_property
+    def feature_names(self) -> list[str]:
+        """Names of the features in their order."""
+        return feature_names(next(iter(self.params.values())).process.controlled)
+
+    @cached_property
+    def n_seeds(self) -> int:
+        """How many seeds were run."""
+        return len({seed for _, seed, _ in self.stages})
+
+    @cached_property
+    def medians(self) -> pd.DataFrame:
+        """Every number over its seeds, `scorecard.summary`."""
+        return scorecard.summary(self.seeds)
+
+    def median(self, case: int, stage: str, metric: str) -> float:
+        """The median of one number over the seeds; nan where no seed gave it."""
+        rows = self.medians.query("case == @case and stage == @stage and metric == @metric")
+        return float(rows["median"].iloc[0]) if len(rows) else float("nan")
+
+    def offline_folder(self, case: int, variant: str = "improved") -> str:
+        """The folder of a case's offline learning."""
+        return _offline_folder(self.params[case], variant)
+
+    def table(self, case: int, folder: str, name: str) -> pd.DataFrame:
+        """One table of one stage, that of every seed below the other, with a column `seed`."""
+        found = {seed: stage for (number, seed, stage_name), stage in self.stages.items() if (number, stage_name) == (case, folder)}
+        return pd.concat([stage.table(name).assign(seed=seed) for seed, stage in found.items()], ignore_index=True)
+
+
+def _offline_folder(params: Params, variant: str) -> str:
+    return f"offline_{variant}" if params.case.offline.transfer_from is None else f"transfer_{variant}"
+
+
+def collect(
+    root: Path, params_root: Path, scale: str, cases: tuple[int, ...], n_seeds: int, missing_allowed: bool = False
+) -> Results:
+    """Read every stage of every case and seed below `root`; claims, budget, trials and limits where they were run.
+
+    Args:
+        missing_allowed: leave out a seed of which a stage is missing, as long as another seed is whole.
+
+    Raises:
+        ArtifactError: if a stage is missing or damaged, or was made from other parameters, code, package versions or earlier
+            results than there are now.
+    """
+    params = {case: load(params_root, case) for case in cases}
+    published = {case: entry for case, entry in load_published(params_root).items() if case in cases}
+    names = {case: _folders(record) for case, record in params.items()}
+    seeds_found = list(range(n_seeds))
+    if missing_allowed:
+        places = [f"case_{case}/{folder}/{RECORD}" for case in cases for folder in names[case]]
+        whole = [seed for seed in seeds_found if all((root / scale / f"seed_{seed}" / place).is_file() for place in places)]
+        seeds_found = whole or seeds_found  # without any, the first file that is missing is named below
+    stages: dict[tuple[int, int, str], Stage] = {}
+    frames = []
+    for case in cases:
+        for seed in seeds_found:
+            for folder, stage_names in names[case].items():
+                notebook = MADE_BY[folder.split("_")[0]]
+                path = root / scale / f"seed_{seed}" / f"case_{case}" / folder
+                stage = load_stage(path, f"notebook {notebook} for case {case} and seed {seed}")
+                stages[case, seed, folder] = stage
+                scores = stage.table("scores.csv", ("stage", "metric", "value"))
+                frames.append(scores.assign(case=case, seed=seed, stage=scores["stage"].map(stage_names)).dropna(subset="stage"))
+    seeds = pd.concat(frames, ignore_index=True)[["case", "seed", "stage", "metric", "value"]]
+    features = feature_names(next(iter(params.values())).process.controlled)
+    seeds = pd.concat([seeds, scorecard.relative(seeds, published, features)], ignore_index=True)
+    experiments = _finished(root / scale, cases, seeds_found, EXPERIMENTS, "notebook 08")
+    budget = _finished(root / scale, cases, seeds_found, BUDGET, "the online budget")
+    trials = {
+        (case, name): _finished(root / scale, (case,), seeds_found, _offline_folder(record, name), f"the trial '{name}'")
+        for case, record in params.items()
+        for name in record.trials
+    }
+    path = root / scale / "seed_0" / INFERRED
+    inferred = load_stage(path, "notebook 00") if (path / RECORD).is_file() else None
+    limits = _limits(root / scale, cases, seeds_found)
+    tried = (stage for found in trials.values() for stage in found.values())
+    beyond = (*experiments.values(), *budget.values(), *tried, *limits.values(), *([inferred] if inferred else []))
+    check([*stages.values(), *beyond], root / scale, params_root)
+    return Results(
+        scale=scale,
+        params=params,
+        published=published,
+        stages=stages,
+        seeds=seeds,
+        claims=_claims(root, params_root, scale, seeds_found) if experiments else pd.DataFrame(columns=list(claims.COLUMNS)),
+        budget=_budget(budget),
+        trials=_trials(params, seeds, trials),
+        inferred=inferred,
+        limits=limits,
+        beyond=beyond,
+        made_from=inputs(REPORT, params_root, scale),
+        missing=tuple(seed for seed in range(n_seeds) if seed not in seeds_found),
+    )
+
+
+def _folders(params: Params) -> dict[str, dict[str, str]]:
+    """The stages of a case by folder, each with its names in scores.csv and their names in the report."""
+    folders = {DEMONSTRATIONS: {"expert": "expert"}}
+    folders[ONLINE] = {name: name for name in ("expert_paired", "online", "online_y", scorecard.MINIMUM_VARIANCE)}
+    folders |= {_offline_folder(params, variant): {"offline": name} for name, variant in OFFLINE.items()}
+    if params.case.offline.transfer_from is not None:
+        folders[SCRATCH] = {"offline": "offline_scratch"}
+    return folders
+
+
+def _finished(root: Path, cases: tuple[int, ...], seeds: Sequence[int], folder: str, made_by: str) -> dict[tuple[int, int], Stage]:
+    """An optional stage by case and seed, where it was run."""
+    paths = {(case, seed): root / f"seed_{seed}" / f"case_{case}" / folder for case in cases for seed in seeds}
+    return {key: load_stage(path, made_by) for key, path in paths.items() if (path / RECORD).is_file()}
+
+
+def _limits(root: Path, cases: tuple[int, ...], seeds: Sequence[int]) -> dict[tuple[int, int, str], Stage]:
+    """The parts of notebook 06 by case, seed and part, where it was run to its end."""
+    found: dict[tuple[int, int, str], Stage] = {}
+    for case, seed in _finished(root, cases, seeds, f"limits_{LIMITS[-1]}", "notebook 06"):
+        folder = root / f"seed_{seed}" / f"case_{case}"
+        found |= {(case, seed, part): load_stage(folder / f"limits_{part}", "notebook 06") for part in LIMITS}
+    return found
+
+
+def _claims(root: Path, params_root: Path, scale: str, seeds: Sequence[int]) -> pd.DataFrame:
+    """The verdicts on the claims."""
+    known = claims.load_claims(params_root)
+    return claims.verdicts(known, claims.collect(known, root, scale, seeds))
+
+
+def _budget(found: Mapping[tuple[int, int], Stage]) -> pd.DataFrame:
+    """The objective after online learning by the episodes of an epoch, where that was run."""
+    columns = ("episodes_per_epoch", "objective")
+    frames = [stage.table("scores.csv", columns).assign(seed=seed, case=case) for (case, seed), stage in found.items()]
+    order = ["seed", "case", *columns]
+    return pd.concat(frames, ignore_index=True)[order] if frames else pd.DataFrame(columns=order)
+
+
+def _trials(
+    params: Mapping[int, Params], seeds: pd.DataFrame, found: Mapping[tuple[int, str], Mapping[tuple[int, int], Stage]]
+) -> pd.DataFrame:
+    """The feature gap of every offline trial that was run, after that of the variants that they are trials of."""
+    rows = []
+    for (case, name), stages in found.items():
+        trial = params[case].trials[name]
+        for (_, seed), stage in stages.items():
+            scores = stage.table("scores.csv", ("stage", "metric", "value")).set_index("metric")["value"]
+            rows.append((name, trial.family, trial.title, case, seed, scores["feature_gap"]))
+    trials = pd.DataFrame(rows, columns=["trial", "family", "description", "case", "seed", "gap"])
+    if trials.empty:
+        return trials
+    gaps = seeds[(seeds["metric"] == "feature_gap") & seeds["stage"].isin(OFFLINE)].rename(columns={"value": "gap"})
+    bases = gaps.assign(trial=gaps["stage"].map(OFFLINE), family="variant", description="as in the other sections")
+    return pd.concat([bases[trials.columns], trials], ignore_index=True)

@@ -1,0 +1,391 @@
+"""Figures 3-6, learning curves and the curve of the online budget.
+
+Every table may hold several runs, told apart by a column `seed`: each is then a thin line, their median a thick one. Every
+figure is drawn from tables and computes no result; `drawn_summary` reads back what was really drawn.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from string import ascii_uppercase
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+
+from helpers.report.tables import feature_symbol, symbol
+from helpers.settings.leaf import DEVIATION
+
+WIDTH = 9.0  # inches; at the 100 dpi of a screen the 900 pixels of the report
+DPI_FILE = 150
+STYLE: dict[Any, Any] = {
+    "figure.dpi": 100,
+    "savefig.dpi": DPI_FILE,
+    "font.size": 10,
+    "axes.labelsize": 10,
+    "axes.titlesize": 10.5,
+    "xtick.labelsize": 9,
+    "ytick.labelsize": 9,
+    "legend.fontsize": 9.5,
+    "lines.linewidth": 1.6,
+    "lines.solid_capstyle": "round",
+    "axes.edgecolor": "#262626",
+    "axes.labelcolor": "#262626",
+    "text.color": "#262626",
+    "xtick.color": "#262626",
+    "ytick.color": "#262626",
+    "axes.linewidth": 1.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "grid.color": "#e8e8e8",
+    "grid.linewidth": 0.7,
+    "font.sans-serif": ["DejaVu Sans", "Verdana", "Arial", "sans-serif"],
+    "mathtext.fontset": "dejavusans",  # in an SVG, letters of \\mathbb and \\mathcal come out as empty boxes: not used
+    "svg.fonttype": "none",  # text stays text: it can be searched and read aloud
+    "svg.hashsalt": "apprenticeship",  # otherwise the identifiers inside an SVG differ from run to run
+}
+
+# The paper's colours; the line styles tell agent and expert apart without them.
+COLOURS = {
+    ("controlled", "agent"): "#d7191c",
+    ("controlled", "expert"): "#00682f",
+    ("manipulated", "agent"): "#1f4fd8",
+    ("manipulated", "expert"): "#5fc45f",
+}
+SET_POINT = "#ff8c00"
+LEVEL = "#00682f"  # horizontal lines to compare with are the expert's, mostly
+LINE_STYLES: dict[str, Any] = {"agent": "-", "expert": (0, (4, 1.6)), "set point": (0, (1, 1.2))}
+KIND_STYLES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.2, 1, 1.2)))
+BAND_OPACITY = 0.2
+BAND = "mean ± standard deviation"
+SINGLE = "single seeds"
+THIN = 0.7  # width of the line of a single seed
+LOOP_COLOURS = ("#0173b2", "#de8f05", "#029e73", "#d55e00", "#cc78bc", "#ca9161")  # told apart by the colour-blind too
+TIME_LABEL = "control interaction (sample)"
+FEW_POINTS = 40  # a curve of at most that many points shows each of them
+MANY_POINTS = 1000  # thin lines of more points become a picture inside the SVG, which would be ten times as large
+
+INK = "#333333"
+MUTED = "#6e6e6e"
+
+
+def use_style() -> None:
+    """One style for all figures, for the whole session: much of it counts only when a figure is written or shown."""
+    plt.rcParams.update(STYLE)
+
+
+use_style()
+
+
+def control_figure(
+    response: pd.DataFrame,
+    controlled: Sequence[str],
+    manipulated: Sequence[str],
+    set_point: Sequence[float],
+    descriptions: Mapping[str, str] | None = None,
+    agent_label: str = r"agent $\pi^A$, after online learning",
+    expert_label: str = r"PID $\pi^E$",
+    zoom_from: int = 5,
+) -> Figure:
+    """Figures 3, 5 and 6: a column for each loop; response and control above, zoomed response below.
+
+    Response and control have axes of their own that share the time axis, so that no scale can be mistaken for another.
+    The zoom leaves out the first samples, which are the way to the set point. The band of an input that often sits at
+    a bound can pass it: it is a standard deviation, not a range.
+
+    Args:
+        response: columns of `stages.response_table`, and `seed` where there are several runs.
+        set_point: of each loop, deviation variables.
+        descriptions: of variables in words, by name.
+        zoom_from: first sample of the zoom.
+    """
+    n_loops = len(controlled)
+    figure = empty_figure(max(WIDTH, WIDTH / 2 * n_loops), 8.2)
+    grid = figure.add_gridspec(3, n_loops, height_ratios=(6, 4, 6))
+    words = descriptions or {}
+    for loop, (output, entry, target) in enumerate(zip(controlled, manipulated, set_point, strict=True)):
+        axes = figure.add_subplot(grid[0, loop])
+        _draw_response(axes, response, output, target)
+        _finish(axes, ascii_uppercase[loop], output, words)
+        axes.tick_params(labelbottom=False)
+        below = figure.add_subplot(grid[1, loop], sharex=axes)
+        _draw_response(below, response, entry)
+        _finish(below, "", entry, words)
+        below.set_xlabel(TIME_LABEL)
+        zoom = figure.add_subplot(grid[2, loop])
+        _draw_response(zoom, response[response["time_index"] >= zoom_from], output, target)
+        _finish(zoom, ascii_uppercase[n_loops + loop], output, words, zoom_from)
+        zoom.set_xlabel(TIME_LABEL)
+    figure.align_ylabels()
+    _legend(figure, response, ("controlled", "manipulated"), agent_label, expert_label)
+    return figure
+
+
+def tracking_figure(
+    response: pd.DataFrame,
+    controlled: Sequence[str],
+    set_point: Sequence[float],
+    descriptions: Mapping[str, str] | None = None,
+    agent_label: str = r"agent $\pi^A$, after offline learning",
+    expert_label: str = r"demonstrated $\pi^E$",
+    n_samples: int = 30,
+) -> Figure:
+    """Figure 4: the response of each loop over the first interactions, learned against demonstrated."""
+    figure = empty_figure(max(WIDTH, WIDTH / 2 * len(controlled)), 4.0)
+    early = response[response["time_index"] <= n_samples]
+    for loop, (output, target) in enumerate(zip(controlled, set_point, strict=True)):
+        axes = figure.add_subplot(1, len(controlled), loop + 1)
+        _draw_response(axes, early, output, target)
+        _finish(axes, ascii_uppercase[loop], output, descriptions or {})
+        axes.set_xlabel(TIME_LABEL)
+    _legend(figure, response, ("controlled",), agent_label, expert_label)
+    return figure
+
+
+def learning_curves(
+    history: pd.DataFrame,
+    marks: Mapping[int, str] | None = None,
+    return_levels: Mapping[str, float] | None = None,
+    gap_levels: Mapping[str, float] | None = None,
+) -> Figure:
+    """Mean return, feature gap and reward weights against the epoch; a panel for each that the history holds.
+
+    Args:
+        history: columns epochs and mean_return, and where they exist feature_gap, alpha:<feature> and seed.
+        marks: epochs worth a vertical line, and why.
+        return_levels, gap_levels: horizontal lines by label, such as the expert's return or the paper's gap.
+    """
+    weights = [column for column in history if column.startswith("alpha:")]
+    panels = ["mean return", *(["feature gap"] if "feature_gap" in history and history["feature_gap"].notna().any() else [])]
+    panels += ["reward weights"] if weights else []
+    figure = empty_figure(max(6.0, WIDTH / 3 * len(panels)), 4.0)
+    epochs = history["epochs"]
+    points: Any = {"marker": "o" if epochs.nunique() <= FEW_POINTS else "", "markersize": 3}
+    n_seeds = _n_seeds(history)
+    for index, panel in enumerate(panels):
+        axes = figure.add_subplot(1, len(panels), index + 1)
+        levels: Mapping[str, float] = {}
+        if panel == "mean return":
+            _draw_runs(axes, history, "epochs", "mean_return", color=INK, label=panel, **points)
+            axes.set_ylabel("discounted return (no unit)")
+            levels = return_levels or {}
+        elif panel == "feature gap":
+            _draw_runs(axes, history, "epochs", "feature_gap", color=INK, label=panel, **points)
+            axes.set_ylabel("gap to the expert (%, log scale)")
+            axes.set_yscale("log")
+            axes.yaxis.set_major_formatter(FuncFormatter(_percent))
+            axes.yaxis.set_minor_formatter(FuncFormatter(_percent_of_few))
+            levels = gap_levels or {}
+        else:
+            styles = feature_styles([column.removeprefix("alpha:") for column in weights])
+            for column, (label, style) in zip(weights, styles.items(), strict=True):
+                _draw_runs(axes, history, "epochs", column, label=label, **style, **points)
+            axes.set_ylabel("weight (no unit)")
+        listed: list[Line2D] = [line for line in axes.lines if panel == "reward weights"]
+        if n_seeds > 1 and panel == "mean return":
+            listed += _seed_handles(n_seeds)
+        for (name, level), style in zip(levels.items(), cycle(KIND_STYLES[1:]), strict=False):
+            listed += axes.plot([epochs.min(), epochs.max()], [level, level], color=LEVEL, linestyle=style, label=name)
+        for (epoch, name), style in zip((marks or {}).items(), cycle(KIND_STYLES[2:]), strict=False):
+            mark = axes.axvline(epoch, color=MUTED, linestyle=style, linewidth=1.2, label=name)
+            listed += [mark] if panel != "reward weights" else []  # the other panels explain it
+        if listed:
+            n_columns = len({name.rpartition("-")[2] for name in weights}) if panel == "reward weights" else 1
+            place: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.19), "frameon": False}
+            legend = axes.legend(handles=listed, ncols=n_columns, columnspacing=1.0, handlelength=2.0, **place)
+            for line in legend.get_lines():
+                line.set_marker("")  # it would hide the dashes
+        letter = ascii_uppercase[index]
+        title = panel[:1].upper() + panel[1:] + (r" $\alpha$" if panel == "reward weights" else "")
+        axes.set_title(f"$\\mathbf{{{letter}}}$  {title}" if len(panels) > 1 else title, loc="left")
+        axes.set_xlabel("epoch")
+        axes.xaxis.set_major_locator(MaxNLocator(5, integer=True, steps=[1, 2, 5, 10]))
+        axes.set_label(f"{letter} {panel}")
+    return figure
+
+
+def budget_curve(axes: Axes, frame: pd.DataFrame, reference: Mapping[str, float]) -> Axes:
+    """The objective after online learning against the plant episodes that each epoch was given.
+
+    Args:
+        frame: columns seed, episodes_per_epoch, objective, of one case.
+        reference: objectives to compare with, by label: horizontal lines.
+    """
+    _draw_runs(axes, frame, "episodes_per_epoch", "objective", color=COLOURS["controlled", "agent"], label="online", marker="o")
+    episodes = np.sort(frame["episodes_per_epoch"].unique())
+    for (name, level), style in zip(reference.items(), cycle(KIND_STYLES[1:]), strict=False):
+        axes.plot(episodes[[0, -1]], [level, level], color=LEVEL, linestyle=style, linewidth=1.2, label=name)
+    axes.set_xscale("log")
+    axes.set_xticks(episodes, [f"{number:g}" for number in episodes])
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xlabel("plant episodes per epoch (log)")
+    axes.set_ylabel("tracking objective $J$ (no unit)")
+    return axes
+
+
+def budget_figure(frame: pd.DataFrame, references: Mapping[int, Mapping[str, float]], titles: Mapping[int, str]) -> Figure:
+    """`budget_curve` for every case side by side.
+
+    Args:
+        frame: columns seed, case, episodes_per_epoch, objective.
+        references, titles: by case.
+    """
+    cases = sorted(frame["case"].unique())
+    figure = empty_figure(max(6.0, WIDTH / 3 * len(cases)), 3.8)
+    for index, case in enumerate(cases):
+        axes = budget_curve(figure.add_subplot(1, len(cases), index + 1), frame[frame["case"] == case], references[case])
+        axes.set_title(f"$\\mathbf{{{ascii_uppercase[index]}}}$  {titles[case]}", loc="left")
+        axes.set_label(f"{ascii_uppercase[index]} case {case}")
+    handles = [*figure.axes[0].lines, *_seed_handles(_n_seeds(frame))[:1]]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
+    return figure
+
+
+def feature_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """A line style for each feature, by its label: one colour a loop, one dash pattern a kind."""
+    parts = {name: name.rpartition("-") for name in names}
+    loops = list(dict.fromkeys(loop for loop, _, _ in parts.values()))
+    kinds = list(dict.fromkeys(kind for _, _, kind in parts.values()))
+    return {
+        feature_symbol(name): {
+            "color": LOOP_COLOURS[loops.index(loop) % len(LOOP_COLOURS)],
+            "linestyle": KIND_STYLES[kinds.index(kind) % len(KIND_STYLES)],
+        }
+        for name, (loop, _, kind) in parts.items()
+    }
+
+
+def drawn_summary(figure: Figure) -> pd.DataFrame:
+    """What the figure really shows, read back from its lines and bands: a row for each.
+
+    Columns: panel, artist (its label), points, from and to (least and greatest x), then of y: first, minimum, maximum,
+    mean, last. The points of a band are those of its outline.
+    """
+    rows = []
+    for axes in figure.axes:
+        panel = axes.get_label() or axes.get_title(loc="left") or axes.get_title()
+        outlines = [(band.get_label(), path.vertices) for band in axes.collections for path in band.get_paths()]
+        for label, points in [*((line.get_label(), line.get_xydata()) for line in axes.lines), *outlines]:
+            x, y = np.asarray(points, dtype=float).T
+            values = {"first": y[0], "minimum": np.nanmin(y), "maximum": np.nanmax(y), "mean": np.nanmean(y), "last": y[-1]}
+            rows.append({"panel": panel, "artist": label, "points": len(y), "from": x.min(), "to": x.max(), **values})
+    columns = ["panel", "artist", "points", "from", "to", "first", "minimum", "maximum", "mean", "last"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def empty_figure(width: float, height: float) -> Figure:
+    """An empty figure that pyplot forgets at once, so that a notebook shows it once and many figures cost no memory."""
+    figure = plt.figure(figsize=(width, height), layout="constrained")
+    plt.close(figure)
+    return figure
+
+
+def _draw_response(axes: Axes, response: pd.DataFrame, variable: str, set_point: float | None = None) -> None:
+    """Mean and band of one variable under expert and agent; an input is drawn as held until the next sample.
+
+    Of several runs the medians of mean and standard deviation at each sample, and the mean of each run as a thin line.
+    """
+    for controller in ("expert", "agent"):
+        rows = response[(response["controller"] == controller) & (response["variable"] == variable)]
+        if rows.empty:
+            raise ValueError(f"response table: expected rows of controller '{controller}' and variable '{variable}', found none")
+        kind = rows["kind"].iloc[0]
+        held: Any = {}
+        if kind == "manipulated":
+            last = rows["time_index"].max()
+            rows = pd.concat([rows, rows[rows["time_index"] == last].assign(time_index=last + 1)])
+            held = {"step": "post"}
+        colour, label = COLOURS[kind, controller], f"{kind}, {controller}"
+        _draw_singles(axes, rows, "time_index", "mean", colour, held=bool(held))
+        middle = rows.groupby("time_index")[["mean", "std"]].median()
+        time, mean, std = middle.index.to_numpy(), middle["mean"].to_numpy(), middle["std"].to_numpy()
+        axes.fill_between(
+            time, mean - std, mean + std, color=colour, alpha=BAND_OPACITY, linewidth=0, label=f"{label}: {BAND}", **held
+        )
+        steps = "steps-post" if held else "default"
+        axes.plot(time, mean, color=colour, linestyle=LINE_STYLES[controller], drawstyle=steps, label=label)
+    limits = [response["time_index"].min(), response["time_index"].max()]
+    if set_point is not None:
+        style = LINE_STYLES["set point"]
+        axes.plot(limits, [set_point, set_point], color=SET_POINT, linestyle=style, linewidth=2, label="set point")
+    axes.set_xlim(*limits)
+
+
+def _n_seeds(frame: pd.DataFrame) -> int:
+    return int(frame["seed"].nunique()) if "seed" in frame else 1
+
+
+def _draw_runs(axes: Axes, frame: pd.DataFrame, x: str, y: str, **style: Any) -> None:
+    """The median over the runs at every x, and each run as a thin line where there are several."""
+    _draw_singles(axes, frame, x, y, style["color"])
+    middle = frame.groupby(x)[y].median()
+    axes.plot(middle.index, middle, **style)
+
+
+def _draw_singles(axes: Axes, frame: pd.DataFrame, x: str, y: str, colour: str, held: bool = False) -> None:
+    """Each of several runs as a thin line, with steps where a value is `held` until the next x; the fainter, the more they are."""
+    n_seeds = _n_seeds(frame)
+    if n_seeds < 2:
+        return
+    lines = []
+    for _, run in frame.sort_values(x).groupby("seed"):
+        points = run[[x, y]].to_numpy(dtype=float)
+        lines.append(np.column_stack([points[:, 0].repeat(2)[1:], points[:, 1].repeat(2)[:-1]]) if held else points)
+    thin: Any = {"linewidth": THIN, "alpha": max(0.4, 1 / n_seeds**0.5), "rasterized": len(frame) > MANY_POINTS}
+    pale = (np.array(to_rgb(colour)) + 1) / 2  # many of them on one another stay lighter than the median
+    axes.add_collection(LineCollection(lines, label=SINGLE, color=pale, **thin))
+    axes.autoscale_view()
+
+
+def _seed_handles(n_seeds: int) -> list[Line2D]:
+    """What thin and thick lines mean, for a legend."""
+    thin = Line2D([], [], color=INK, linewidth=THIN, label=f"thin: each of {n_seeds} seeds")
+    return [thin, Line2D([], [], color=INK, label="thick: their median")]
+
+
+def _finish(axes: Axes, letter: str, variable: str, descriptions: Mapping[str, str], zoom_from: int | None = None) -> None:
+    """Title, label and unit of a panel; the letter of a panel stands on its first axes only."""
+    words = descriptions.get(variable, "")
+    title = f"{words[:1].upper()}{words[1:]} {symbol(variable)}".strip()
+    if zoom_from is not None:
+        title = f"Zoom of {symbol(variable)} from sample {zoom_from}"
+    axes.set_title(f"$\\mathbf{{{letter}}}$  {title}" if letter else title, loc="left")
+    axes.set_ylabel(f"{symbol(variable)} ({DEVIATION})".replace(", ", ",\n"))
+    axes.set_label(" ".join(part for part in (letter, variable, "" if zoom_from is None else "zoom") if part))
+    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True, steps=[1, 2, 5, 10]))
+
+
+def _legend(figure: Figure, response: pd.DataFrame, kinds: Sequence[str], agent_label: str, expert_label: str) -> None:
+    """Every line and band of the figure, below its panels."""
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color=COLOURS[kind, controller], linestyle=LINE_STYLES[controller], label=f"{kind} variable, {label}")
+        for kind in kinds
+        for controller, label in (("agent", agent_label), ("expert", expert_label))
+    ]
+    n_seeds = _n_seeds(response)
+    over = f", medians over {n_seeds} seeds" if n_seeds > 1 else ""
+    below = [Line2D([], [], color=SET_POINT, linestyle=LINE_STYLES["set point"], linewidth=2, label="set point")]
+    if n_seeds > 1:
+        below.append(Line2D([], [], color=INK, linewidth=THIN, label="thin lines: the mean of each seed"))
+    band = Patch(facecolor="#888888", alpha=0.35, label=f"line and band: {BAND}{over}")
+    # A legend fills column by column: one for the outputs, one for the inputs, where there are both.
+    handles = [*handles[:2], *below, *handles[2:], band]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
+
+
+def _percent(share: float, position: int | None = None) -> str:
+    return f"{100 * share:.3g}"
+
+
+def _percent_of_few(share: float, position: int | None = None) -> str:
+    """Labels of the minor ticks of a decade: only those at 2 and 5 times a power of ten."""
+    return _percent(share) if f"{share:.0e}"[0] in "25" else ""

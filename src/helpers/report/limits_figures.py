@@ -1,0 +1,155 @@
+"""Figures of notebook 06, drawn from tables; they compute no result."""
+
+from collections.abc import Mapping, Sequence
+from string import ascii_uppercase
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import TwoSlopeNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from helpers.report.figures import INK, KIND_STYLES, LOOP_COLOURS, MUTED, WIDTH, empty_figure
+
+LABELS = {
+    "expert": "PID (demonstrator)",
+    "offline": "offline policy",
+    "online": "online policy",
+    "online_there": "improved on that plant",
+    "clone": "cloning",
+    "irl_reinforce": "IRL, then REINFORCE",
+    "clone_reinforce": "cloning, then REINFORCE",
+    "scratch_reinforce": "REINFORCE from scratch",
+    "ppo": "PPO from scratch",
+    "recurrent_ppo": "RecurrentPPO from scratch",
+    "pid_tuned": "PID, tuned",
+    "mpc": "offset-free MPC",
+    "minimum_variance": "minimum variance on y",
+    "minimum_variance_filtered": "minimum variance, filtered y",
+    "minimum_variance_x": "minimum variance on x",
+    "dynamic_programme_filtered": "programme, filtered y",
+    "dynamic_programme": "programme on x",
+}
+LEARNERS = ("irl_reinforce", "clone_reinforce", "scratch_reinforce", "ppo", "recurrent_ppo", "pid_tuned")
+LEVELS = ("mpc", "minimum_variance", "expert", "dynamic_programme")
+GRIDS = {  # of each group of conditions: title, label of the rows, label of the columns
+    "model": ("mismatch of the model", "A, times", "B, times"),
+    "noise": ("disturbance and observation noise", "disturbance, times", "observation noise, times"),
+    "set_point": ("set points not trained on", "set point of the first loop, times", "of the other, times"),
+    "time": ("dead time and load", "dead time, samples", "load, share of the change"),
+}
+
+
+def gap_figure(gaps: pd.DataFrame) -> Figure:
+    """The gap of every controller to the dynamic programme with its 95 % interval; a panel for each beta.
+
+    Args:
+        gaps: columns beta, controller, gap, gap_low, gap_high, in per cent.
+    """
+    betas = sorted(gaps["beta"].unique())
+    figure = empty_figure(WIDTH, 0.6 + 0.27 * gaps["controller"].nunique())
+    for index, (beta, axes) in enumerate(zip(betas, np.atleast_1d(figure.subplots(1, len(betas), sharey=True)), strict=True)):
+        rows = gaps[gaps["beta"] == beta].set_index("controller")
+        rows = rows.reindex([name for name in LABELS if name in rows.index])[::-1]
+        reach = np.stack([rows["gap"] - rows["gap_low"], rows["gap_high"] - rows["gap"]])
+        axes.errorbar(rows["gap"], range(len(rows)), xerr=reach, fmt="o", color=INK, markersize=4, label="gap and 95 % interval")
+        axes.axvline(0, color=MUTED, linewidth=1)
+        axes.set_yticks(range(len(rows)), [LABELS[name] for name in rows.index])
+        axes.set_xlabel("gap to the programme (%)")
+        axes.set_title(f"$\\mathbf{{{ascii_uppercase[index]}}}$  $\\beta = {beta:g}$", loc="left")
+        axes.set_label(f"{ascii_uppercase[index]} beta {beta:g}")
+    return figure
+
+
+def budget_curves(curves: pd.DataFrame, levels: Mapping[str, float]) -> Figure:
+    """The objective against the plant episodes spent, a line for each learner, beside those that do not learn.
+
+    Args:
+        curves: columns learner, episodes, objective, and seed where there are several; the line is then the median and the band
+            around it holds the middle half of the seeds.
+        levels: objectives of controllers that do not learn.
+    """
+    figure = empty_figure(WIDTH, 4.4)
+    axes = figure.subplots()
+    markers = "osv^D*"
+    names = [name for name in LEARNERS if name in set(curves["learner"])]
+    for index, name in enumerate(names):
+        spent = curves[curves["learner"] == name].groupby("episodes")["objective"]
+        low, line, high = (spent.quantile(share) for share in (0.25, 0.5, 0.75))
+        style: dict[str, Any] = {"color": LOOP_COLOURS[index % len(LOOP_COLOURS)], "marker": markers[index % len(markers)]}
+        axes.plot(line.index, line, label=LABELS[name], markersize=4, **style)
+        if (high > low).any():
+            axes.fill_between(line.index, low, high, color=style["color"], alpha=0.15, linewidth=0)
+    known = [name for name in LEVELS if name in levels]
+    for index, name in enumerate(known):
+        style = {"color": MUTED, "linestyle": KIND_STYLES[index % len(KIND_STYLES)], "linewidth": 1.2}
+        axes.axhline(levels[name], label=LABELS[name], **style)
+    axes.set_xlabel("plant episodes spent")
+    axes.set_ylabel("tracking objective $J$ on $x$ (no unit)")
+    axes.set_ylim(bottom=0)
+    axes.set_label("budget")
+    figure.legend(loc="outside right upper", frameon=False)
+    return figure
+
+
+def heat_maps(robustness: pd.DataFrame, group: str, controllers: Sequence[str]) -> Figure:
+    """A heat map for each controller: its objective under every condition, coloured by its share of the PID's there.
+
+    Args:
+        robustness: columns group, row, column, controller, objective.
+    """
+    title, row_label, column_label = GRIDS[group]
+    found = robustness[robustness["group"] == group]
+    rows, columns = list(dict.fromkeys(found["row"])), list(dict.fromkeys(found["column"]))
+    table = found.pivot_table(index=["controller", "row"], columns="column", values="objective", sort=False)
+    reference = table.loc["expert"].loc[rows, columns].to_numpy()
+    across = 3
+    down = -(-len(controllers) // across)
+    figure = empty_figure(WIDTH, 0.9 + down * (0.55 + 0.26 * len(rows)))
+    norm, colours = TwoSlopeNorm(100, 40, 160), "PuOr"
+    for index, name in enumerate(controllers):
+        axes = figure.add_subplot(down, across, index + 1)
+        values = table.loc[name].loc[rows, columns].to_numpy()
+        share = 100 * values / reference
+        axes.imshow(share, cmap=colours, norm=norm, aspect="auto")
+        for (row, column), value in np.ndenumerate(values):
+            pale = 60 < share[row, column] < 140
+            axes.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=7.5, color=INK if pale else "white")
+        axes.set_xticks(range(len(columns)), columns if index >= len(controllers) - across else [""] * len(columns))
+        axes.set_yticks(range(len(rows)), rows if index % across == 0 else [""] * len(rows))
+        axes.set_title(LABELS[name], fontsize=9, loc="left")
+        axes.grid(visible=False)
+        axes.set_label(f"{name} {group}")
+    figure.supxlabel(column_label, fontsize=10)
+    figure.supylabel(row_label, fontsize=10)
+    bar = figure.colorbar(ScalarMappable(norm, colours), ax=figure.axes, shrink=0.8, aspect=30, extend="both")
+    bar.set_label("$J$, % of the PID's there")
+    figure.suptitle(f"{title[:1].upper()}{title[1:]}: $J$ on $x$ of each controller", fontsize=10.5, x=0.02, ha="left")
+    return figure
+
+
+def regret_figure(episodes: pd.DataFrame) -> Figure:
+    """What exploring costs: the worst episode of each epoch beside the PID's, and the cumulative regret against the PID.
+
+    Args:
+        episodes: columns run, epoch, episode, objective, expert.
+    """
+    words = {"hot": "hot start", "scratch": "from scratch"}
+    figure = empty_figure(WIDTH, 3.8)
+    left, right = figure.subplots(1, 2)
+    for index, (run, group) in enumerate(episodes.groupby("run", sort=False)):
+        style: dict[str, Any] = {"color": LOOP_COLOURS[index], "linestyle": KIND_STYLES[index]}
+        worst = group.groupby("epoch")[["objective", "expert"]].min()
+        left.plot(worst.index, worst["objective"], label=words[str(run)], marker="o", markersize=3, **style)
+        right.plot(group["episode"], (group["expert"] - group["objective"]).cumsum(), label=words[str(run)], **style)
+    left.plot(worst.index, worst["expert"], color=MUTED, linestyle=KIND_STYLES[2], label="PID, same disturbances")
+    left.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+    left.set(xlabel="epoch", ylabel="$J$ of the worst episode (no unit)")
+    right.set(xlabel="plant episode", ylabel="cumulative regret\nagainst the PID (no unit)")
+    for axes, letter, name in ((left, "A", "worst episode"), (right, "B", "regret")):
+        axes.set_title(f"$\\mathbf{{{letter}}}$  {name[:1].upper()}{name[1:]}", loc="left")
+        axes.set_label(f"{letter} {name}")
+    figure.legend(handles=left.lines, loc="outside lower center", ncols=3, frameon=False)
+    return figure

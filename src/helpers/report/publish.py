@@ -1,0 +1,208 @@
+"""Copy the last report to reports/reference, where it is committed: `python -m helpers publish`."""
+
+import argparse
+import json
+import shutil
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from helpers.report.limits_figures import LABELS, LEARNERS
+from helpers.report.tables import ROMAN, spread
+from helpers.runs.artifacts import code_revision
+from helpers.runs.sources import PROJECT
+
+LATEST, REFERENCE, RESULTS = PROJECT / "reports/latest", PROJECT / "reports/reference", PROJECT / "results"
+LIMITS = "tables/limits_gaps.csv"
+# Of README's gaps to the optimum:
+SHOWN = ("expert", "online", *LEARNERS, "mpc", "minimum_variance", "dynamic_programme_filtered")
+PARTS = ("report.html", "figures", "tables", "comparison.csv", "seeds.csv", "provenance.json")
+
+
+class PublishError(RuntimeError):
+    """The last run may not become the reference; one sentence says why."""
+
+
+def read_provenance(folder: Path) -> dict[str, Any]:
+    """The provenance of a report."""
+    path = folder / "provenance.json"
+    if not path.is_file():
+        raise PublishError(f"{path}: there is no report; run make reports first")
+    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return found
+
+
+def check(latest: dict[str, Any], reference: dict[str, Any] | None, revision: str) -> None:
+    """Refuse what must not be published.
+
+    Raises:
+        PublishError: for a run at smoke scale, with uncommitted code, of other code than that checked out, or with fewer
+            seeds than the published one, or without some of the seeds asked for. A stage may be of an earlier commit: the report
+            has made sure that nothing behind it has changed since.
+    """
+    if latest["scale"] != "paper":
+        raise PublishError(f"reports/latest was run at {latest['scale']} scale; only paper scale is published")
+    committed = all(name.isalnum() and name != "unknown" for name in (revision, *latest["revisions_of_stages"]))
+    if latest["revision"] != revision or not committed:
+        found = ", ".join(sorted({latest["revision"], *latest["revisions_of_stages"], revision}))
+        raise PublishError(f"run and code must be committed alike, found {found}; commit, run make reports again, then publish")
+    if missing := latest.get("missing_seeds"):
+        raise PublishError(f"the run lacks the seeds {', '.join(map(str, missing))}; run make reports again")
+    if reference is not None and len(latest["seeds"]) < len(reference["seeds"]):
+        raise PublishError(f"the run has {len(latest['seeds'])} seeds, the published one {len(reference['seeds'])}")
+
+
+def glance(gaps: pd.DataFrame) -> str:
+    """README's comparison at a glance, as Markdown, from tables/gaps.csv: one row a case study."""
+    rows = []
+    for numbers in gaps.to_dict("records"):
+        row = {"case study": ROMAN[int(numbers["case"]) - 1]}
+        row["expert error"] = _percent(numbers, "expert_error")
+        row["feature gap, paper"] = _percent(numbers, "published_gap")
+        row["feature gap, ours"] = _percent(numbers, "feature_gap")
+        row["the same, algorithms as printed"] = _percent(numbers, "printed_gap")
+        row["online objective, share of minimum variance"] = _percent(numbers, "online_share")
+        rows.append(row)
+    n_seeds = int(gaps["n_seeds"].min())
+    intervals = " and 95 % bootstrap intervals of the median" if gaps["feature_gap_low"].notna().all() else ""
+    seeds = "one seed" if n_seeds == 1 else f"medians{intervals} over {n_seeds} seeds"
+    return f"{pd.DataFrame(rows).to_markdown(index=False)}\n\n(ours: {seeds})"
+
+
+def _percent(numbers: Mapping[Any, Any], name: str) -> str:
+    """A share in per cent, with the ends of its interval where it has one."""
+    median, low, high = (100 * numbers.get(f"{name}{end}", float("nan")) for end in ("", "_low", "_high"))
+    return spread({"median": median, "ci_low": low, "ci_high": high}, decimals=1, unit=" %")
+
+
+def time_by_stage(time: pd.DataFrame) -> str:
+    """README's seconds by stage and case, as Markdown, from tables/time.csv."""
+    wide = time.pivot_table(index="stage", columns="case", values="seconds")
+    wide.columns = [f"case {case}, s" for case in wide.columns]
+    cells = wide.map(lambda seconds: "–" if pd.isna(seconds) else f"{seconds:.0f}").reset_index()
+    return f"Seconds inside each stage's notebook, medians over seeds, two stages at a time:\n\n{cells.to_markdown(index=False)}"
+
+
+def limits_at_a_glance(gaps: pd.DataFrame) -> str:
+    """README's gaps to the optimum, as Markdown, from tables/limits_gaps.csv: those under the greatest beta."""
+    columns = pd.DataFrame([name.split(", $\\beta$ = ") for name in gaps.columns[1:]], columns=["case", "beta"])
+    sharpest = columns["beta"].astype(float).max()
+    chosen = {f"{case}, $\\beta$ = {sharpest:g}": f"case {case}, %" for case in columns["case"].unique()}
+    shown = gaps[gaps["controller"].isin([LABELS[name] for name in SHOWN])][["controller", *chosen]].rename(columns=chosen)
+    return str(shown.to_markdown(index=False, disable_numparse=True))
+
+
+def fill(text: str, block: str, content: str) -> str:
+    """The text with `content` between the marks of a block."""
+    head, found, rest = text.partition(f"<!-- {block}:")
+    mark, closed, old_and_tail = rest.partition("-->\n")
+    _, ended, tail = old_and_tail.partition(f"<!-- /{block} -->")
+    if not (found and closed and ended):
+        raise PublishError(f"README.md: the marks of the block '{block}' are missing")
+    return f"{head}{found}{mark}{closed}{content}\n{ended}{tail}"
+
+
+def check_copies(copies: Iterable[Path]) -> None:
+    """Refuse executed copies of notebooks that failed: a mark beside each says so."""
+    if failed := [path for path in copies if path.with_suffix(".failed").exists()]:
+        raise PublishError(f"{', '.join(map(str, failed))}: failed when it was run last; run make reports or make evidence again")
+
+
+def check_tables(latest: Path, reference: Path) -> None:
+    """Refuse a report without the claims or the limits that the published one has."""
+    if missing := [name for name in ("tables/claims.csv", LIMITS) if (reference / name).exists() and not (latest / name).exists()]:
+        raise PublishError(f"{latest}: the run lacks {' and '.join(missing)}, which the published one has; run make evidence")
+
+
+def executed_copies(first: Path) -> dict[str, Path]:
+    """The executed copies to publish, by their published names; `first` is the folder of the first seed's results."""
+    copies = {
+        f"{path.stem.removesuffix('_improved')}_{path.parents[1].name}.ipynb": path
+        for path in sorted(first.glob("case_*/notebooks/[!.]*.ipynb"))
+    }
+    copies["05_report.ipynb"] = LATEST / "notebooks/05_report.ipynb"
+    if (first / "inferred_settings").is_dir():
+        copies["00_inferred_settings.ipynb"] = first / "notebooks/00_inferred_settings.ipynb"
+    return copies
+
+
+def publish() -> None:
+    """Check the last run, put it in the place of the reference and its numbers into README.
+
+    Raises:
+        PublishError, OSError: if the run may not be published, or cannot be.
+    """
+    latest = read_provenance(LATEST)
+    reference = read_provenance(REFERENCE) if (REFERENCE / "provenance.json").is_file() else None
+    check(latest, reference, code_revision(PROJECT))
+    check_tables(LATEST, REFERENCE)
+    first = RESULTS / latest["scale"] / f"seed_{latest['seeds'][0]}"
+    copies = executed_copies(first)
+    check_copies(copies.values())
+    readme = PROJECT / "README.md"
+    text = fill(readme.read_text(encoding="utf-8"), "glance", glance(pd.read_csv(LATEST / "tables/gaps.csv")))
+    if (LATEST / LIMITS).exists():
+        text = fill(text, "limits", limits_at_a_glance(pd.read_csv(LATEST / LIMITS)))
+    text = fill(text, "time", time_by_stage(pd.read_csv(LATEST / "tables/time.csv")))
+    partial, old = _beside("partial"), _beside("old")
+    for part in PARTS:
+        _copy(LATEST / part, partial / part)
+    for name, path in copies.items():
+        _copy(path, partial / "notebooks" / name)
+    if (first / "inferred_settings").is_dir():
+        _copy(first / "inferred_settings", partial / "inferred_settings")
+    for part in ("benchmarks", "inferred_settings", "reliability.md"):  # runs of their own, which stay
+        if (REFERENCE / part).exists() and not (partial / part).exists():
+            _copy(REFERENCE / part, partial / part)
+    if REFERENCE.exists():
+        REFERENCE.rename(old)
+    partial.rename(REFERENCE)
+    readme.write_text(text, encoding="utf-8")
+
+
+def _beside(word: str) -> Path:
+    """A hidden folder beside the reference, which git ignores."""
+    return REFERENCE.with_name(f".reference.{word}")
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy a file or a folder, with its times."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if source.is_dir():
+        shutil.copytree(source, target)
+    else:
+        shutil.copy2(source, target)
+
+
+def _tidy() -> None:
+    """Remove what a publish left half done; the old reference comes back where the new one did not take its place."""
+    shutil.rmtree(_beside("partial"), ignore_errors=True)
+    if _beside("old").is_dir() and not REFERENCE.exists():
+        _beside("old").rename(REFERENCE)
+    shutil.rmtree(_beside("old"), ignore_errors=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Publish; returns the exit status."""
+    argparse.ArgumentParser(prog="python -m helpers publish", description=__doc__).parse_args(arguments)
+    try:
+        _tidy()  # after one that was killed
+        try:
+            publish()
+        finally:
+            _tidy()
+    except PublishError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except shutil.Error as error:  # of a folder: source, target and reason of each file; the first will do
+        source, _, why = error.args[0][0]
+        print(f"error: {source}: could not be published: {why}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f"error: {error.filename or LATEST}: could not be published: {error.strerror or error}", file=sys.stderr)
+        return 1
+    print(f"published: {REFERENCE}")
+    return 0

@@ -1,0 +1,292 @@
+"""The reproduction against the paper: medians and intervals over seeds, and a verdict for every published number."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+
+from helpers.report.statistics import median_interval, prediction_interval
+from helpers.report.tables import NOT_KNOWN, RESULT_DECIMALS, ROMAN, feature_symbol
+from helpers.settings.paper import PublishedCase
+
+REPRODUCED_BY = {"expert": ("expert", "v"), "policy": ("offline", "v"), "alpha": ("offline", "alpha")}  # stage, metric
+MINIMUM_VARIANCE = "minimum_variance"  # the stage of the controller to measure online learning by
+FITTED = "expert"  # this row's settings were inferred from the very numbers that it is compared with
+ROWS = {"expert": "features of the expert", "policy": "features of the policy", "alpha": "weights"}
+HEADLINE = "improved"  # the variant that trials are compared with
+VERDICTS = ("match", "differs", "cannot tell", "fitted")
+WIDEST = 0.25  # half the width of a prediction interval that can still tell, as a share of the published value
+PUBLISHED_TRAJECTORIES = 500  # behind a published feature, Section 5.1.1
+COLUMNS = ["table", "case", "row", "feature", "published", "reproduced", "n_seeds"]
+COLUMNS += ["ci_low", "ci_high", "pred_low", "pred_high", "verdict", "reason"]
+KEYS = ["case", "stage", "metric"]
+
+
+def summary(seeds: pd.DataFrame) -> pd.DataFrame:
+    """Every number over its seeds: case, stage, metric, n_seeds, median, ci_low, ci_high, least, p90, greatest.
+
+    ci_low and ci_high are the ends of the 95 % bootstrap interval of the median, nan for too few seeds; p90 is the 90th percentile.
+    A seed without the number (nan) is left out.
+
+    Args:
+        seeds: columns case, seed, stage, metric, value.
+    """
+    runs = seeds.pivot_table(index=KEYS, columns="seed", values="value")
+    columns = ["n_seeds", "median", "ci_low", "ci_high", "least", "p90", "greatest"]
+    found = pd.DataFrame(index=runs.index, columns=columns, dtype=float)
+    for n_seeds, rows in runs.groupby(runs.count(axis=1)):
+        values = rows.to_numpy()[rows.notna().to_numpy()].reshape(len(rows), n_seeds)
+        found.loc[rows.index, "n_seeds"] = n_seeds
+        found.loc[rows.index, ["ci_low", "ci_high"]] = median_interval(values)
+        found.loc[rows.index, ["least", "median", "p90", "greatest"]] = np.quantile(values, [0, 0.5, 0.9, 1], axis=1).T
+    return found.astype({"n_seeds": int}).reset_index()
+
+
+def relative(seeds: pd.DataFrame, published: Mapping[int, PublishedCase], feature_names: Sequence[str]) -> pd.DataFrame:
+    """Two ratios of each seed, as further rows of `seeds`.
+
+    Stage expert, metric published_error: the mean relative error of our expert's features against the printed row. Every stage that
+    was measured beside minimum-variance control, metric share: its objective on x, divided by that controller's on the same
+    disturbances.
+    """
+    wide = seeds.pivot_table(index=["case", "seed", "stage"], columns="metric", values="value").reset_index("stage")
+    rows = []
+    for case, printed in published.items():
+        expert = wide[(wide.index.get_level_values("case") == case) & (wide["stage"] == "expert")]
+        theirs = np.array(printed.expert)
+        error = (expert.reindex(columns=[f"v:{name}" for name in feature_names]) - theirs).abs() / np.abs(theirs)
+        rows.append(error.mean(axis=1, skipna=False).rename("value").reset_index().assign(stage="expert", metric="published_error"))
+    reference = wide.loc[wide["stage"] == MINIMUM_VARIANCE, "objective_x"]
+    for stage, own in wide.groupby("stage"):
+        share = (own["objective_x"] / reference.reindex(own.index)).dropna()
+        rows.append(share.rename("value").reset_index().assign(stage=stage, metric="share"))
+    return pd.concat(rows, ignore_index=True)[list(seeds.columns)]
+
+
+def gaps(medians: pd.DataFrame, published: Mapping[int, PublishedCase]) -> pd.DataFrame:
+    """How near the learned policy comes to the expert, and how near online learning to minimum-variance control.
+
+    Columns: case; n_seeds; feature_gap, its median, with the ends of its interval, the 90th percentile and the greatest;
+    published_gap, the mean of |v_pi - v_E| / |v_E| over the paper's own rows; printed_gap (of the algorithms as printed),
+    expert_error and online_share, medians with the ends of their intervals. All but the first two are shares of one; what no seed
+    gave is nan.
+
+    Args:
+        medians: of `summary`, with the rows of `relative`.
+    """
+    rows = []
+    for case, printed in published.items():
+        by_number = medians[medians["case"] == case].set_index(["stage", "metric"])
+        wanted = {"offline": "feature_gap", "offline_printed": "feature_gap", "expert": "published_error", "online": "share"}
+        gap, as_printed, error, share = (by_number.reindex([key]).iloc[0] for key in wanted.items())
+        row = {"case": case, "n_seeds": int(np.nan_to_num(gap["n_seeds"])), "feature_gap": gap["median"]}
+        row |= {f"feature_gap_{name.removeprefix('ci_')}": gap[name] for name in ("ci_low", "ci_high", "p90", "greatest")}
+        row["published_gap"] = printed.feature_gap
+        for name, ours in (("printed_gap", as_printed), ("expert_error", error), ("online_share", share)):
+            row |= {name: ours["median"], f"{name}_low": ours["ci_low"], f"{name}_high": ours["ci_high"]}
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def verdict(row: str, published: float, n_seeds: int, low: float, high: float) -> tuple[str, str]:
+    """The verdict on one published number and, in a clause, its reason. The rule:
+
+    `fitted` for the row whose settings were inferred from these numbers; `cannot tell` with fewer than two seeds, or where the
+    prediction interval reaches further than a quarter of the published value to either side of its middle; otherwise `match`
+    where the published value lies inside the interval, its ends included, and `differs` where it does not.
+
+    Args:
+        low, high: 95 % prediction interval for one run.
+    """
+    if n_seeds < 2:
+        return ("fitted" if row == FITTED else "cannot tell"), ("one seed" if n_seeds else "no seed gave it")
+    decimals, reach = RESULT_DECIMALS[row], (high - low) / 2
+    inside = low <= published <= high
+    if inside:
+        reason = f"inside {low:.{decimals}f} to {high:.{decimals}f}"
+    else:
+        distance = max(published - high, low - published)
+        reason = f"{distance:.2g} {'above' if published > high else 'below'} the interval"
+    if row == FITTED:
+        return "fitted", reason
+    if reach > WIDEST * abs(published):
+        return "cannot tell", f"one run scatters by {reach:.2g} to either side of {(low + high) / 2:.{decimals}f}"
+    return ("match" if inside else "differs"), reason
+
+
+def comparison(
+    published: Mapping[int, PublishedCase],
+    seeds: pd.DataFrame,
+    medians: pd.DataFrame,
+    feature_names: Sequence[str],
+    trajectories: Mapping[str, int],
+    sampling_errors: Mapping[tuple[int, str], float] | None = None,
+) -> pd.DataFrame:
+    """One row for each published number of Tables 2-4, beside the median of ours over the seeds.
+
+    ci_low and ci_high are the 95 % bootstrap interval of the median; pred_low and pred_high the 95 % prediction interval for
+    one run as the paper reports it. A published feature is a mean over 500 trajectories; ours are means over more, so that the
+    sampling variance they lack, s^2 (1/500 - 1/K), is added. Weights carry no such error beyond their run's own.
+    A number that no seed gave is nan with n_seeds 0.
+
+    Args:
+        seeds: columns case, seed, stage, metric, value; `medians`: their `summary`.
+        trajectories: K of each row that holds features.
+        sampling_errors: s/sqrt(500) by case and feature, where another than that of our own trajectories is to be taken.
+    """
+    found = medians.set_index(KEYS)
+    runs = {key: group.dropna().to_numpy() for key, group in seeds.groupby(KEYS)["value"]}
+    rows = []
+    for case, printed in published.items():
+        for row, (stage, metric) in REPRODUCED_BY.items():
+            for feature, value in zip(feature_names, getattr(printed, row), strict=True):
+                key = (case, stage, f"{metric}:{feature}")
+                if key not in found.index:
+                    rows.append([printed.table, case, row, feature, value, np.nan, 0, *[np.nan] * 4, *verdict(row, value, 0, 0, 0)])
+                    continue
+                lacking = 0.0
+                if metric == "v":
+                    share = max(0.0, 1 / PUBLISHED_TRAJECTORIES - 1 / trajectories[row])
+                    if error := (sampling_errors or {}).get((case, feature)):
+                        variance = PUBLISHED_TRAJECTORIES * error**2
+                    else:
+                        variance = float(np.mean(runs[case, stage, f"v:{feature}:std"] ** 2))
+                    lacking = variance * share
+                low, high = prediction_interval(runs[key], lacking)
+                ours = found.loc[key]
+                n_seeds = int(ours["n_seeds"])
+                numbers = [ours["median"], n_seeds, ours["ci_low"], ours["ci_high"], low, high]
+                rows.append([printed.table, case, row, feature, value, *numbers, *verdict(row, value, n_seeds, low, high)])
+    return pd.DataFrame(rows, columns=COLUMNS)
+
+
+def sampling_errors(prediction: pd.DataFrame, published: Mapping[int, PublishedCase]) -> dict[tuple[int, str], float]:
+    """The standard error of a published Type III feature, by case and feature, as the fit of the settings has it.
+
+    There |e| before the first step is each trajectory's own, here its mean, one: the same expectation, but a wider scatter.
+
+    Args:
+        prediction: columns table, feature, published, simulated, deviation (in these standard errors) of the expert's features.
+    """
+    case_of = {record.table: case for case, record in published.items()}
+    rows = prediction[prediction["feature"].str.endswith("-III") & prediction["table"].isin(case_of)]
+    errors = ((rows["simulated"] - rows["published"]) / rows["deviation"]).abs()
+    return errors.groupby([rows["table"].map(case_of), rows["feature"]]).median().to_dict()
+
+
+def changed(compared: pd.DataFrame, other: pd.DataFrame) -> pd.DataFrame:
+    """The published numbers whose verdict another sampling error changes, with both verdicts."""
+    both = compared.assign(verdict_with_the_wider_error=other["verdict"])
+    columns = ["table", "row", "feature", "published", "reproduced", "verdict", "verdict_with_the_wider_error"]
+    return both.loc[compared["verdict"] != other["verdict"], columns].reset_index(drop=True)
+
+
+def outside(compared: pd.DataFrame) -> dict[str, int]:
+    """How many published numbers of each verdict lie outside the prediction interval of one run."""
+    beyond = (compared["published"] < compared["pred_low"]) | (compared["published"] > compared["pred_high"])
+    return beyond.groupby(compared["verdict"]).sum().reindex(VERDICTS, fill_value=0).to_dict()
+
+
+def counts(compared: pd.DataFrame) -> pd.DataFrame:
+    """How many published numbers have each verdict: a row for each kind of number, a column for each verdict."""
+    table = pd.crosstab(compared["row"], compared["verdict"]).reindex(index=list(ROWS), columns=list(VERDICTS), fill_value=0)
+    return table.rename(index=ROWS).rename_axis(index="published numbers", columns=None).reset_index()
+
+
+def listing(compared: pd.DataFrame, wanted: str) -> str:
+    """Which published numbers have a verdict, case by case; empty for none."""
+    of_row = compared.groupby(["case", "row"])["feature"].count()
+    lines = []
+    for case, of_case in compared[compared["verdict"] == wanted].groupby("case"):
+        kinds = []
+        for row, features in of_case.groupby("row", sort=False)["feature"]:
+            symbols = ", ".join(features.map(feature_symbol)).replace("-", "\u2011")  # a hyphen at which no line breaks
+            kinds.append(f"all {ROWS[row]}" if len(features) == of_row[case, row] else f"{ROWS[row]} {symbols}")
+        lines.append(f"Case Study {ROMAN[case - 1]}: {'; '.join(kinds)}")
+    return ". ".join(lines)
+
+
+def nearer_to_expert(compared: pd.DataFrame) -> int:
+    """How many features of the policy differ from the printed ones and lie nearer to the printed expert than those do."""
+    numbers = compared.set_index(["row", "case", "feature"]).sort_index()
+    policy, expert = numbers.loc["policy"], numbers.loc["expert", "published"]
+    nearer = (policy["reproduced"] - expert).abs() < (policy["published"] - expert).abs()
+    return int((nearer & (policy["verdict"] == "differs")).sum())
+
+
+def held_out(prediction: pd.DataFrame) -> pd.DataFrame:
+    """How far the settings fitted to some tables reproduce each table: a row for each pair of them.
+
+    Columns: fitted_on, table, role (fit or prediction), mean_error and greatest_error (of the features, in per cent),
+    greatest_deviation (in sampling errors of a published feature).
+
+    Args:
+        prediction: columns fitted_on, table, deviation and relative_error of each feature, on trajectories that no fit has seen.
+    """
+    rows = []
+    for (fitted_on, table), features in prediction.groupby(["fitted_on", "table"], sort=False):
+        fitted = fitted_on == "parameter files" or str(table) in fitted_on.removeprefix("Table ").split(" and ")
+        errors = 100 * features["relative_error"].abs()
+        rows.append(
+            {
+                "fitted_on": fitted_on,
+                "table": table,
+                "role": "fit" if fitted else "prediction",
+                "mean_error, %": errors.mean(),
+                "greatest_error, %": errors.max(),
+                "greatest_deviation": features["deviation"].abs().max(),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def against_headline(trials: pd.DataFrame) -> dict[str, str]:
+    """By trial, the cases in which it is better or worse than the variant `improved`, paired by seed, by the whole interval.
+
+    Args:
+        trials: columns trial, case, seed, gap (a share of one); the variants are among the trials.
+    """
+    gaps = trials.pivot_table(index=["case", "seed"], columns="trial", values="gap")
+    found = {}
+    for name in gaps.drop(columns=HEADLINE):
+        cases: dict[str, list[str]] = {"better": [], "worse": []}
+        for case, differences in (gaps[name] - gaps[HEADLINE]).dropna().groupby("case"):
+            low, high = median_interval(differences.to_numpy())
+            if word := "better" if high < 0 else "worse" if low > 0 else "":
+                cases[word].append(ROMAN[case - 1])
+        found[name] = "; ".join(f"{word} in {', '.join(numerals)}" for word, numerals in cases.items() if numerals) or NOT_KNOWN
+    return found
+
+
+def verdicts_of_claims(claims: pd.DataFrame) -> dict[str, list[str]]:
+    """The claims, each with its section, by what all its cases and quantities say together.
+
+    A claim `holds` where it holds throughout, `holds in part` where it holds in some and not in others, `does not hold` where
+    it fails somewhere and holds nowhere; otherwise one `cannot tell`, or it is `not comparable`.
+
+    Args:
+        claims: columns id, section, statement, case, quantity, verdict.
+    """
+    found: dict[str, list[str]] = {"holds": [], "holds in part": [], "does not hold": [], "cannot tell": [], "not comparable": []}
+    for _, rows in claims.groupby("id", sort=False):
+        statement = rows["statement"].iloc[0]
+        text = f"{statement[:1].upper()}{statement[1:]} ({rows['section'].iloc[0]})"
+        verdicts = set(rows["verdict"])
+        if len(verdicts) == 1:
+            found[verdicts.pop()].append(text)
+        elif {"holds", "does not hold"} <= verdicts:
+            found["holds in part"].append(f"{text}: not for {_failing(rows)}")
+        else:
+            found["does not hold" if "does not hold" in verdicts else "cannot tell"].append(text)
+    return found
+
+
+def _failing(rows: pd.DataFrame) -> str:
+    """Where a claim fails: its cases, and which quantities, or how many, in a case in which others do not fail."""
+    places = []
+    for case, of_case in rows.groupby("case"):
+        failing = of_case.loc[of_case["verdict"] == "does not hold", "quantity"]
+        if len(failing):
+            named = "; ".join(failing) if len(failing) < 3 else f"{len(failing)} of {len(of_case)} quantities"
+            places.append(f"Case Study {ROMAN[case - 1]}{f' ({named})' if len(failing) < len(of_case) else ''}")
+    return ", ".join(places)

@@ -1,0 +1,194 @@
+"""Validated, frozen records of the extra runs behind the claims and of how the inferred settings are found."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from helpers.settings.leaf import (
+    DEVIATION,
+    EPISODES_PER_EPOCH,
+    Count,
+    Leaf,
+    NotNegative,
+    NotZero,
+    ParameterError,
+    Positive,
+    Real,
+    Record,
+    Share,
+    Text,
+    Vector,
+    read_yaml,
+    validate,
+)
+from helpers.settings.paper import Params
+
+
+class ComparisonParams(Record):
+    """How controllers are compared."""
+
+    n_last: Annotated[Count, Leaf("samples")]
+    band: Annotated[Positive, Leaf("share of the set point change")]
+    beta: Annotated[Positive, Leaf("-")]
+
+
+class ExperimentCases(Record):
+    """The cases in which an experiment is run."""
+
+    cases: Annotated[tuple[Count, ...], Leaf("case")]
+
+
+class FrozenWeightsParams(ExperimentCases):
+    """A policy from scratch under weights that stay as they are."""
+
+    epochs: Annotated[Count, Leaf("epochs")]
+
+
+class BetaParams(ExperimentCases):
+    """Online learning at several values of beta."""
+
+    betas: Annotated[tuple[Positive, ...], Field(min_length=1), Leaf("-")]
+
+
+class BudgetParams(ExperimentCases):
+    """Online learning with several numbers of plant episodes an epoch."""
+
+    episodes: Annotated[tuple[Annotated[Count, Field(gt=1, le=EPISODES_PER_EPOCH)], ...], Field(min_length=1), Leaf("episodes")]
+
+
+class BaselineParams(ExperimentCases):
+    """The spread of the policy gradient with and without the baseline of Algorithm 1."""
+
+    batches: Annotated[Count, Field(gt=1), Leaf("batches")]
+    episodes: Annotated[Count, Field(gt=1), Leaf("episodes")]
+
+
+class FeatureSetsParams(ExperimentCases):
+    """Algorithm 2 on some of the features, and on all of them alike."""
+
+    epochs: Annotated[Count, Leaf("epochs")]
+
+
+class OtherDemonstratorParams(ExperimentCases):
+    """Demonstrators other than the PID."""
+
+    epochs: Annotated[Count, Leaf("epochs")]
+    horizon: Annotated[Count, Leaf("samples")]
+    move_penalty: Annotated[Positive, Leaf("-")]
+    by_hand: Annotated[Text, Leaf("-")]
+    held: Annotated[Real, Leaf(DEVIATION)]
+    threshold: Annotated[NotNegative, Leaf("-")]
+    rest_std: Annotated[Share, Leaf("share of initial_std")]
+
+
+class CloningParams(ExperimentCases):
+    """Behavioural cloning."""
+
+    demonstrations: Annotated[tuple[Annotated[Count, Field(gt=1)], ...], Field(min_length=1), Leaf("trajectories")]
+    steps: Annotated[Count, Leaf("gradient steps")]
+    batch: Annotated[Count, Leaf("trajectories")]
+    learning_rate_start: Annotated[Share, Leaf("-")]
+    learning_rate_end: Annotated[Share, Leaf("-")]
+    validation: Annotated[Positive, Field(lt=1), Leaf("share")]
+    check_every: Annotated[Count, Leaf("gradient steps")]
+
+
+class FewerDemonstrationsParams(ExperimentCases):
+    """Algorithm 2 on a part of the demonstrations."""
+
+    demonstrations: Annotated[tuple[Annotated[Count, Field(gt=1)], ...], Field(min_length=1), Leaf("trajectories")]
+    epochs: Annotated[Count, Leaf("epochs")]
+
+
+class ConditionParams(Record):
+    """Conditions that no learning has seen."""
+
+    initial_shift: Annotated[Vector, Leaf("initial_std")]
+    set_point_factor: Annotated[tuple[NotZero, ...], Field(min_length=1), Leaf("share of set_point")]
+    disturbance_factor: Annotated[Positive, Leaf("share of disturbance")]
+
+
+class ExperimentParams(Record):
+    """params/experiments.yaml: the extra runs behind the claims."""
+
+    comparison: ComparisonParams
+    frozen_weights: FrozenWeightsParams
+    undiscounted: ExperimentCases
+    beta: BetaParams
+    budget: BudgetParams
+    baseline: BaselineParams
+    feature_sets: FeatureSetsParams
+    demonstrators: OtherDemonstratorParams
+    cloning: CloningParams
+    fewer_demonstrations: FewerDemonstrationsParams
+    conditions: ConditionParams
+
+
+class SearchParams(Record):
+    """Upper ends of the search for the inferred settings, one entry an input or a control loop."""
+
+    sampling_time: Annotated[Positive, Leaf("time")]
+    input_bound: Annotated[tuple[Positive, ...], Leaf(DEVIATION)]
+    proportional: Annotated[tuple[Positive, ...], Leaf("input/output")]
+    integral: Annotated[tuple[Positive, ...], Leaf("input/(output time)")]
+    derivative: Annotated[tuple[Positive, ...], Leaf("input time/output")]
+
+
+class IdentificationScaleParams(Record):
+    """How much the search for the inferred settings computes."""
+
+    starts: Annotated[Count, Leaf("starts")]
+    evaluations: Annotated[Count, Leaf("evaluations")]
+    evaluations_reading: Annotated[Count, Leaf("evaluations")]
+    draws_search: Annotated[Count, Field(gt=1), Leaf("trajectories")]
+    draws: Annotated[Count, Field(gt=1), Leaf("trajectories")]
+    draws_final: Annotated[Count, Field(gt=1), Leaf("trajectories")]
+    iterations: Annotated[Count, Leaf("iterations")]
+    profile_steps: Annotated[Count, Leaf("steps to each side")]
+    fresh: Annotated[Count, Field(gt=1), Leaf("trajectories")]
+    readings: Annotated[Count, Leaf("readings")]
+
+
+class IdentificationParams(Record):
+    """params/identification.yaml: how the settings that the paper leaves out are inferred."""
+
+    sample: Annotated[Count, Leaf("trajectories")]
+    settled_by: Annotated[Text, Leaf("-")]
+    overdamped: Annotated[Text, Leaf("-")]
+    overshoot_unit: Annotated[Positive, Leaf("share of the set point change")]
+    interval: Annotated[Positive, Leaf("-")]
+    identified: Annotated[Positive, Leaf("share of the value")]
+    search: SearchParams
+    scales: dict[Text, IdentificationScaleParams]
+
+
+def load_experiments(root: Path, params: Params) -> ExperimentParams:
+    """The settings of the extra runs, from experiments.yaml, for the process of a case."""
+    path = root / "experiments.yaml"
+    record = validate(ExperimentParams, read_yaml(path), path)
+    if record.demonstrators.by_hand not in params.process.manipulated:
+        known, found = ", ".join(params.process.manipulated), record.demonstrators.by_hand
+        raise ParameterError(f"{path}: key 'demonstrators.by_hand': expected one of {known}, found '{found}'")
+    expected = len(params.process.controlled)
+    for name in ("initial_shift", "set_point_factor"):
+        value = getattr(record.conditions, name)
+        if len(value) != expected:
+            key = f"conditions.{name}"
+            raise ParameterError(f"{path}: key '{key}': expected {expected} entries, one a variable, found {len(value)}")
+    return record
+
+
+def load_identification(root: Path, params: Params) -> IdentificationParams:
+    """How the inferred settings are found, from identification.yaml, for the process of a case."""
+    path = root / "identification.yaml"
+    record = validate(IdentificationParams, read_yaml(path), path)
+    expected = len(params.process.controlled)
+    for name in ("input_bound", "proportional", "integral", "derivative"):
+        value = getattr(record.search, name)
+        if len(value) != expected:
+            raise ParameterError(f"{path}: key 'search.{name}': expected {expected} entries, one a loop, found {len(value)}")
+    for scale in params.learning.scales:
+        if scale not in record.scales:
+            raise ParameterError(f"{path}: key 'scales.{scale}': the key is missing")
+    return record

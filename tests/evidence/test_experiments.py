@@ -1,0 +1,162 @@
+"""The extra runs: their pieces by hand, and that they give every number which the claims ask for."""
+
+import shutil
+from dataclasses import replace
+
+import pytest
+import torch
+from ruamel.yaml import YAML
+
+from helpers.evidence import experiments
+from helpers.evidence.experiments import attempt, first_epoch, plan, prepare, response_figures, varied
+from helpers.plant.task import Trajectories
+from helpers.runs import stages
+from helpers.runs.session import open_session
+
+STREAMS = {"input_root": "", "output_root": ""}
+
+
+def short(root, folder):
+    """Parameter files with one epoch and few trajectories."""
+    shutil.copytree(root, folder)
+    yaml = YAML(typ="safe", pure=True)
+    path = folder / "learning.yaml"
+    content = yaml.load(path)
+    for name, value in {"epoch_share": 0.001, "episodes": 4, "measured": 2, "evaluation": 20, "expert_evaluation": 20}.items():
+        content["scales"]["smoke"][name]["value"] = value
+    yaml.dump(content, path)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def files(root, tmp_path_factory):
+    return short(root, tmp_path_factory.mktemp("files") / "params")
+
+
+@pytest.fixture(scope="module")
+def prepared(files):
+    def build(case=1):
+        given = {"case": case, "seed": 0, "scale": "smoke", "params_root": str(files), **STREAMS}
+        return prepare(open_session("08_claims", given))
+
+    return build
+
+
+def trajectories(session, errors):
+    """Two equal trajectories whose normalised error at t = 1..T is given, shape (T, n_y)."""
+    task = session.task
+    error = torch.tensor(errors, dtype=session.dtype)
+    x = torch.cat([torch.zeros_like(error[:1]), task.set_point - error * task.error_scale])[:, None].repeat(1, 2, 1)
+    u = torch.zeros(len(error), 2, 2, dtype=session.dtype)
+    return Trajectories(x, x, u, u)
+
+
+def test_response_figures_by_hand(prepared):
+    run = prepared()
+    session, comparison = run.session, run.params.comparison.model_copy(update={"n_last": 2})
+    # First loop: passes its set point by 0.2, comes back, ends 0.01 short. Second loop: never gets there.
+    batch = trajectories(session, [[1.0, 1.0], [0.0, 0.9], [-0.2, 0.8], [0.04, 0.7], [0.01, 0.6]])
+    found = response_figures(session, batch, comparison)
+    dt = session.params.process.sampling_time
+    expected = {
+        "tail_error": (0.04 + 0.01 + 0.7 + 0.6) / 4,
+        "settling_time:C_A": 3 * dt,
+        "settling_time:T": 5 * dt,
+        "abs_offset:C_A": 0.025,
+        "abs_offset:T": 0.65,
+        "overshoot:C_A": 0.2,
+        "overshoot:T": 0.0,
+        "excess_travel:C_A": 1.0 + 0.2 + 0.24 + 0.03 - 0.99,
+        "excess_travel:T": 0.0,
+        "rise_time:T": session.task.n_steps * dt,
+    }
+    assert {name: found[name] for name in expected} == pytest.approx(expected, abs=1e-12)
+
+
+def test_readings_by_hand(prepared):
+    run = prepared()
+    weights = torch.tensor([0.1, -0.2, 0.3, -0.1, 0.2, 0.1], dtype=torch.float64)
+    found = experiments.readings(replace(run, weights=weights))["readings"]
+    assert found["loop_share:C_A"] == pytest.approx(0.6)
+    # At rest with T at 4 and no other input, -3.997 C_A - 0.446 x 4 = 0; the set point of C_A is -1.
+    assert found["pulled:C_A"] == pytest.approx(-0.446 * 4 / 3.997 / -1)
+    assert found["pulled:T"] == pytest.approx(-6.092 * -1 / 1.581 / 4)
+    error = run.session.features.errors(run.demonstrations.trajectories)
+    never = [sum(bool((error[:, k, loop] > 0).all()) for k in range(error.shape[1])) / error.shape[1] for loop in (0, 1)]
+    assert [found["never_reached:C_A"], found["never_reached:T"]] == never
+
+
+def test_first_epoch():
+    assert first_epoch([1, 2, 3, 4], [0.0, 5.0, 3.0, 6.0], 4.0) == 2
+    assert first_epoch([1, 2, 3, 4], [0.0, 5.0, 3.0, 6.0], 7.0) == 5
+
+
+def test_a_varied_session_differs_in_what_was_asked_for_alone(prepared):
+    session = prepared().session
+    other = varied(session, case={"set_point": (2.0, 5.0)}, offline={"epochs": 7}, process={"disturbance": (0.0, 0.0)})
+    assert other.task.set_point.tolist() == [2.0, 5.0]
+    assert other.params.case.offline.epochs == 7
+    assert not other.process.disturbance_gain.any()
+    assert session.task.set_point.tolist() == [-1.0, 4.0]
+    assert (other.params.case.online, other.params.features) == (session.params.case.online, session.params.features)
+    assert torch.equal(torch.rand(3, generator=other.stream("a")), torch.rand(3, generator=session.stream("a")))
+
+
+def test_where_no_reward_can_be_found_the_policy_stays_as_it_was(prepared):
+    """exp(-(beta e)^2) is nought in floating point for every error that an untrained policy makes."""
+    session = prepared().session
+    start = stages.fresh_policy(session)
+    policy, curve = attempt(session, start, [1e9, 1e9])
+    assert policy is start
+    assert curve.empty
+    policy, curve = attempt(session, start, [1.0, 1.0])
+    assert policy is not start
+    assert len(curve) == 2
+    before, after = (torch.cat([entry.flatten() for entry in one.parameters()]) for one in (start, stages.fresh_policy(session)))
+    assert torch.equal(before, after)  # the start itself was not trained
+
+
+def test_the_online_run_of_notebook_03_is_taken_over_and_would_come_out_the_same(root):
+    run = prepare(open_session("08_claims", {"case": 1, "seed": 0, "scale": "smoke", "params_root": str(root), **STREAMS}))
+    betas = run.session.params.case.online.beta
+    policy, curve = experiments.from_imitator(run, list(betas))
+    assert policy is run.improved
+    repeated, again = attempt(run.session, run.imitator, betas)
+    assert curve[again.columns.tolist()].to_numpy() == pytest.approx(again.to_numpy(), rel=1e-6)
+    taken, judged = (stages.judge(run.session, experiments.mode(run.session, one))["objective"] for one in (policy, repeated))
+    assert taken == pytest.approx(judged, rel=1e-6)
+    assert experiments.from_imitator(run, [beta / 2 for beta in betas])[0] is not run.improved
+
+
+def test_a_policy_learned_under_weights_follows_them(prepared):
+    """With one weight alone, on closeness of the first loop, that feature grows and others may not."""
+    session = replace(
+        prepared().session, scale_params=prepared().session.scale_params.model_copy(update={"episodes": 60, "epoch_share": 1.0})
+    )
+    session = varied(session, features={"beta": 1.0})
+    weights = torch.tensor([1.0, 0, 0, 0, 0, 0], dtype=session.dtype)
+    means = [
+        session.features.trajectory(experiments.mode(session, policy)).mean(0)[0].item()
+        for policy in (stages.fresh_policy(session), experiments.learn_under(session, weights, 12, "test"))
+    ]
+    assert means[1] > means[0] + 3
+
+
+def test_the_baseline_lowers_the_spread(prepared):
+    run = prepared()
+    found = experiments.gradient_spread(run)["gradient"]
+    assert found["variance:none"] == 1.0
+    assert all(0 < found[f"variance:{kind}"] < 0.5 for kind in ("mean", "regression"))
+
+
+def test_what_is_not_planned_is_not_run(prepared):
+    run = prepared(3)
+    assert experiments.sharpness(run) == {}
+    assert plan(run).set_index("experiment").loc["beta"].tolist() == ["[2]", False]
+
+
+def test_transfer_counts_epochs_of_both_histories(prepared):
+    assert experiments.transfer(prepared(1)) == {}
+    found = experiments.transfer(prepared(3))
+    assert found["from_scratch"]["epochs_to_level"] <= 8  # the length of the smoke run's history
+    assert found["transfer"]["epochs_to_level"] <= 9

@@ -1,0 +1,63 @@
+"""Notebook 00 goes on behind the last fit of an interrupted run, and finds the same numbers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from helpers.evidence import inferred_settings
+from helpers.runs.session import open_identification
+
+
+@pytest.fixture
+def study(tmp_path):
+    """A study at smoke scale that keeps what it has finished at once."""
+    given = {"seed": 0, "scale": "smoke", "input_root": "", "output_root": str(tmp_path), "params_root": ""}
+    found = inferred_settings.study(open_identification("00_inferred_settings", given))
+    return replace(found, finished=replace(found.finished, interval=0.0))
+
+
+def test_an_interrupted_search_goes_on_behind_its_last_fit(study, monkeypatch):
+    problem, computed = study.problem(study.second), []
+    fit, folder = inferred_settings.fit, study.finished.folder
+    undisturbed = [fit(problem, study.session.scale_params, start) for start in range(2)]
+
+    def interrupted(problem, scale, start):
+        if start == 1:
+            raise KeyboardInterrupt
+        return fit(problem, scale, start)
+
+    def counted(problem, scale, start):
+        computed.append(start)
+        return fit(problem, scale, start)
+
+    monkeypatch.setattr(inferred_settings, "fit", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        study.fit(problem)
+    assert len(list(folder.iterdir())) == 1
+    monkeypatch.setattr(inferred_settings, "fit", counted)
+    found = study.fit(problem)
+    assert computed == [1]
+    assert study.fit(replace(problem, overshoot_unit=None))[0].loss != found[0].loss  # another problem, fitted anew
+    assert computed == [1, 0, 1]
+    for one, other in zip(found, sorted(undisturbed, key=lambda found: found.loss), strict=True):
+        assert (one.settings, one.loss) == (other.settings, other.loss)
+        assert np.array_equal(one.z, other.z)
+
+
+def test_an_interrupted_profile_is_not_walked_twice(study, monkeypatch):
+    problem = study.problem(study.first)
+    best, key = study.refit(problem, study.filed(study.first)), next(iter(problem.free))
+    walked = study.profile(problem, best, key, 4.0)
+    monkeypatch.setattr(inferred_settings, "profile", None)
+    again = study.profile(problem, best, key, 4.0)
+    assert np.array_equal(walked.grid, again.grid)
+    assert np.array_equal(walked.losses, again.losses)
+    assert len(walked.grid) > 1
+
+
+def test_what_was_kept_goes_when_the_results_are_written(study):
+    study.refit(study.problem(study.first), study.filed(study.first))
+    assert study.finished.folder.is_dir()
+    inferred_settings.save(study, {}, {})
+    assert not study.finished.folder.exists()

@@ -1,0 +1,191 @@
+"""The verbs of notebook 06, at a size where each can be checked by another route."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from helpers.evidence import equal_budget, exploration, limits, robustness
+from helpers.evidence.attainable import Tabulated
+from helpers.learning.evaluation import objective
+from helpers.report import limits_answer
+from helpers.report.limits_figures import LABELS, budget_curves, gap_figure, heat_maps, regret_figure
+from helpers.runs import stages
+from helpers.runs.session import open_session
+from tests.evidence.test_experiments import short
+
+
+@pytest.fixture(scope="module")
+def contest(root, tmp_path_factory):
+    files = short(root, tmp_path_factory.mktemp("files") / "params")
+    given = {"case": 2, "seed": 0, "scale": "smoke", "params_root": str(files), "input_root": "", "output_root": ""}
+    found = limits.enter(open_session("06_limits_and_alternatives", given))
+    small = {"draws": 60, "episodes": 24, "listed": (0, 12, 24), "every": 12, "judged": 20, "grid": 4}
+    scale = found.scale.model_copy(update=small)
+    params = found.params.model_copy(update={"scales": {"smoke": scale}})
+    params = params.model_copy(update={"tuning": params.tuning.model_copy(update={"episodes": 1})})
+    return equal_budget.Contest(found.prepared, params)
+
+
+@pytest.fixture(scope="module")
+def attained(contest):
+    return limits.attainable(contest)
+
+
+@pytest.fixture(scope="module")
+def learned(contest):
+    return equal_budget.learn_all(contest)
+
+
+def test_the_grids_say_whether_they_agree(contest, attained):
+    _, grids = attained
+    assert sorted(grids["beta"].unique()) == [10.0, 30.0]
+    for row in grids.to_dict("records"):
+        close = abs(row["difference"]) <= 0.005 and abs(row["change"]) <= 0.005
+        assert bool(row["agrees"]) == (close and min(row["value"], row["monte_carlo"]) >= row["minimum_variance_x"])
+        assert row["value"] == pytest.approx(row["monte_carlo"] * (1 + row["difference"]))
+
+
+@pytest.mark.torture
+def test_every_alternative_has_a_curve_and_spends_no_more_than_its_budget(contest, learned):
+    curves = equal_budget.curves(learned)
+    assert set(learned) == {"clone", "irl_reinforce", "clone_reinforce", "scratch_reinforce", "pid_tuned", "mpc"}
+    assert set(learned) < set(LABELS)
+    for name, curve in curves.groupby("learner"):
+        assert curve["episodes"].min() == 0
+        assert curve["episodes"].max() <= contest.scale.episodes, name
+        assert curve["episodes"].is_monotonic_increasing
+    last = curves.groupby("learner")["episodes"].max()
+    assert last[["irl_reinforce", "scratch_reinforce"]].tolist() == [24, 24]
+    assert last[["clone", "mpc"]].tolist() == [0, 0]
+
+
+@pytest.mark.torture
+def test_what_does_not_learn_keeps_its_value_at_every_budget(contest, learned):
+    table = equal_budget.at_budgets(equal_budget.curves(learned), contest)
+    assert table.columns.tolist() == [0, 12, 24]
+    assert (table.loc["mpc"] == table.loc["mpc", 0]).all()
+    assert table.notna().all(axis=None)
+    returns = contest.returns(stages.fresh_trajectories(contest.session, contest.session.expert, contest.scale.judged))
+    assert table.loc["pid_tuned", 0] == pytest.approx(returns.mean().item())  # the search begins with the demonstrator
+
+
+def test_the_reward_is_dense_at_first_where_asked(contest):
+    assert [contest.sharpness(episodes, True) for episodes in (0, 2, 3, 24)] == [10.0, 10.0, 30.0, 30.0]
+    assert contest.sharpness(0, False) == 30.0
+
+
+def test_a_library_that_is_missing_is_one_sentence(contest, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "stable_baselines3", None)
+    monkeypatch.delitem(__import__("sys").modules, "helpers.evidence.library_learners", raising=False)
+    monkeypatch.delattr("helpers.evidence.library_learners", raising=False)
+    with pytest.raises(equal_budget.PackageError, match=r"ppo needs a package that is not installed .*\[alternatives\]"):
+        equal_budget.from_library(contest, "ppo")
+
+
+def test_gaps_are_to_the_programme_on_the_same_draws(contest, attained, learned):
+    optima, _ = attained
+    table = limits.gaps(contest, optima, learned).set_index(["beta", "controller"])
+    best = table.loc[(30.0, "dynamic_programme")]
+    assert (best["gap"], best["gap_low"], best["gap_high"]) == (0.0, 0.0, 0.0)
+    exact = limits.without_noise(contest.session)
+    expected = objective(
+        stages.fresh_trajectories(exact, Tabulated(optima[30.0]), contest.scale.draws), exact.features.on("x"), 30.0
+    ).mean()
+    assert best["objective"] == pytest.approx(expected.item())
+    for _, row in table.iterrows():
+        assert row["gap_low"] <= row["gap"] <= row["gap_high"]
+    share = table.loc[(30.0, "mpc"), "objective"] / best["objective"]
+    assert table.loc[(30.0, "mpc"), "gap"] == pytest.approx(100 * (1 - share))
+    budget = equal_budget.at_budgets(equal_budget.curves(learned), contest)
+    assert "below the programme" in limits_answer.answer(table.loc[contest.beta], budget)
+
+
+def test_the_interval_of_a_gap_covers_as_it_should():
+    """Paired ratios of known mean, 400 times."""
+    generator, covered = torch.Generator().manual_seed(0), 0
+    for _ in range(400):
+        common = torch.rand(200, generator=generator, dtype=torch.float64)
+        best, values = 20 + common, 0.9 * (20 + common) + torch.randn(200, generator=generator, dtype=torch.float64)
+        gap = limits._gap(values, best)
+        covered += gap["gap_low"] <= 10.0 <= gap["gap_high"]
+    assert 0.92 < covered / 400 < 0.98
+
+
+def test_the_scorecard_holds_every_figure_of_every_controller(contest, attained):
+    optimum = attained[0][30.0]
+    builds, still = (limits.of_the_paper(contest) | limits.known_process(contest, optimum, flag) for flag in (False, True))
+    table = limits.control_quality(contest, builds, still).set_index(["controller", "figure"])["value"]
+    figures = {name for controller, name in table.index if controller == "expert"}
+    for controller in builds:
+        assert {name for one, name in table.index if one == controller} == figures
+    assert {"ise:C_A", "settling_time_2_single:T", "harris:T", "at_bound:T_E", "iae_worst:C_A"} <= figures
+    assert (table.xs("iae_worst:T", level="figure") >= table.xs("iae:T", level="figure")).all()
+
+
+def everywhere(contest):
+    """The contest under every condition, as at paper scale."""
+    scale = contest.scale.model_copy(update={"corners": False})
+    return replace(contest, params=contest.params.model_copy(update={"scales": {contest.session.scale: scale}}))
+
+
+def test_conditions_differ_in_what_they_name(contest):
+    found = {(one.group, one.row, one.column): one for one in robustness.conditions(everywhere(contest))}
+    assert len(found) == 25 + 16 + 16 + 4
+    at_the_corners = [(one.group, one.row, one.column) for one in robustness.conditions(contest)]
+    assert len(at_the_corners) == 4 * 4
+    assert set(at_the_corners) < found.keys()
+    nominal = contest.session.process
+    scaled = found["model", "1.3", "0.7"].plant.process
+    assert torch.allclose(scaled.drift_state, 1.3 * nominal.drift_state)
+    assert torch.allclose(scaled.drift_input, 0.7 * nominal.drift_input)
+    quiet = found["noise", "0", "4"].plant.process
+    assert not quiet.disturbance_gain.any()
+    assert torch.allclose(quiet.observation_noise, 4 * nominal.observation_noise)
+    told = found["set_point", "0.5", "1.25"]
+    assert told.told.task.set_point.tolist() == [0.5, 5.0]
+    assert told.told.expert.set_point.tolist() == [0.5, 5.0]
+    assert (found["time", "1", "0.03"].dead_time, found["time", "1", "0.03"].load) == (1, 0.03)
+
+
+def test_nominal_conditions_give_the_nominal_objective(contest):
+    table = robustness.robustness(everywhere(contest), {"expert": lambda run: run.expert})
+    table = table.set_index(["group", "row", "column"])["objective"]
+    returns = contest.returns(stages.fresh_trajectories(contest.session, contest.session.expert, contest.scale.grid)).mean()
+    for key in (("model", "1", "1"), ("noise", "1", "1"), ("set_point", "1", "1"), ("time", "0", "0")):
+        assert table[key] == pytest.approx(returns.item())
+    assert table["time", "1", "0"] != table["time", "0", "0"]
+
+
+def test_exploring_is_paired_with_the_pid_on_the_same_draws(contest):
+    episodes = exploration.exploring_episodes(contest)
+    assert episodes.groupby("run", sort=False).size().tolist() == [2 * contest.batch] * 2  # one epoch in each of two rounds
+    hot, scratch = (group["expert"].to_numpy() for _, group in episodes.groupby("run", sort=False))
+    assert hot == pytest.approx(scratch)  # both runs draw from the same stream, whatever their policies do
+    found = exploration.safety(episodes).set_index("run").loc["scratch"]
+    rows = episodes[episodes["run"] == "scratch"]
+    assert found["worst"] == rows["objective"].min()
+    assert found["regret"] == pytest.approx((rows["expert"] - rows["objective"]).sum())
+    assert found["worse"] == np.mean(rows["expert"] > rows["objective"])
+
+
+def test_figures_show_the_tables(contest):
+    curves = pd.DataFrame({"learner": ["ppo", "ppo"], "episodes": [0, 10], "objective": [1.0, 2.0]})
+    (axes,) = budget_curves(curves, {"mpc": 3.0}).axes
+    assert [line.get_ydata()[-1] for line in axes.lines] == [2.0, 3.0]
+    gaps = pd.DataFrame(
+        {"beta": [30.0, 30.0], "controller": ["expert", "mpc"], "gap": [20.0, 5.0], "gap_low": 1.0, "gap_high": 21.0}
+    )
+    (axes,) = gap_figure(gaps).axes
+    assert axes.lines[0].get_xdata().tolist() == [5.0, 20.0]  # the first controller on top
+    robust = robustness.robustness(contest, {"expert": lambda run: run.expert, "mpc": lambda run: run.minimum_variance})
+    maps = heat_maps(robust, "time", ["expert", "mpc"])
+    texts = [text.get_text() for text in maps.axes[1].texts]
+    wanted = robust.query("group == 'time' and controller == 'mpc'")["objective"]
+    assert texts == [f"{value:.1f}" for value in wanted]
+    episodes = pd.DataFrame({"run": "hot", "epoch": [1, 1, 2], "episode": [1, 2, 3], "objective": [1.0, 5.0, 4.0], "expert": 3.0})
+    left, right = regret_figure(episodes).axes
+    assert left.lines[0].get_ydata().tolist() == [1.0, 4.0]
+    assert right.lines[0].get_ydata().tolist() == [2.0, 0.0, -1.0]

@@ -1,0 +1,96 @@
+"""Figures of control quality: by hand, and step-response figures against python-control."""
+
+import control
+import numpy as np
+import pytest
+import torch
+
+from helpers.learning.control_quality import (
+    harris_index,
+    input_figures,
+    integral_errors,
+    overshoot,
+    quality,
+    rise_time,
+    settling_time,
+    worst_mean,
+)
+from helpers.plant.rollout import rollout, stream
+from helpers.plant.task import Trajectories
+from helpers.settings.limits import load_limits
+
+DT = 0.04
+TIME = np.arange(0, 201) * DT
+
+
+@pytest.mark.parametrize(("frequency", "damping"), [(3.0, 0.2), (2.0, 0.5), (4.0, 0.9), (1.5, 1.5)])
+@pytest.mark.parametrize("band", [0.02, 0.05])
+def test_step_response_figures_are_those_of_python_control(frequency, damping, band):
+    """A second-order system without noise, about the set point of one."""
+    system = control.tf([frequency**2], [1, 2 * damping * frequency, frequency**2])
+    _, y = control.step_response(system, TIME)
+    expected = control.step_info(y, TIME, yfinal=1.0, SettlingTimeThreshold=band)
+    response = torch.from_numpy(y.copy())[:, None]
+    assert overshoot(response).item() == pytest.approx(expected["Overshoot"] / 100, abs=1e-12)
+    assert rise_time(response, DT).item() == pytest.approx(expected["RiseTime"], abs=1e-9)
+    assert settling_time(response, DT, band).item() == pytest.approx(expected["SettlingTime"], abs=1e-9)
+
+
+def test_noise_free_responses_of_the_pid_agree_with_python_control(study, root):
+    """Both loops of the study itself: one comes back after an overshoot, both are about the set point, not the last sample."""
+    quiet = {"disturbance": (1e-9, 1e-9), "observation_noise": (0.0, 0.0)}
+    case = study(1, process=quiet, case_study={"initial_std": (0.0, 0.0)})
+    batch = rollout(case.process, case.pid, case.task, 2, stream(0, "quiet"))
+    params = load_limits(root, case.params).quality
+    names = (case.params.process.controlled, case.params.process.manipulated)
+    found = quality(batch, case.features, params, *names)
+    dt = case.params.process.sampling_time
+    time = np.arange(len(batch.x)) * dt
+    for loop, name in enumerate(names[0]):
+        y = batch.x[:, 0, loop].numpy()
+        for band in params.bands:
+            target = case.task.set_point[loop].item()
+            expected = control.step_info(y, time, yfinal=target, SettlingTimeThreshold=band)
+            settling = found[f"settling_time_{100 * band:g}:{name}"]
+            assert settling == pytest.approx(expected["SettlingTime"], abs=1e-6, nan_ok=True)
+        assert found[f"rise_time:{name}"] == pytest.approx(expected["RiseTime"], abs=1e-6)
+        assert found[f"overshoot:{name}"] == pytest.approx(expected["Overshoot"] / 100, abs=1e-6)
+        assert found[f"rise_time_single:{name}"] == pytest.approx(found[f"rise_time:{name}"], abs=1e-6)
+
+
+def test_what_is_never_reached_is_undefined():
+    response = torch.tensor([[0.0, 0.0], [0.5, 0.95], [0.8, 1.2]])
+    assert rise_time(response, DT).isnan().tolist() == [True, False]
+    assert settling_time(response, DT, 0.05).isnan().all()
+    assert overshoot(response).tolist() == [0.0, pytest.approx(0.2)]
+
+
+def test_integral_errors_by_hand():
+    error = torch.tensor([[[1.0]], [[-0.5]], [[0.25]]])
+    found = {name: value.item() for name, value in integral_errors(error, 0.1).items()}
+    assert found == pytest.approx({"ise": 0.1 * 1.3125, "iae": 0.1 * 1.75, "itae": 0.1 * (0.1 + 0.2 * 0.5 + 0.3 * 0.25)})
+
+
+def test_the_worst_are_averaged():
+    values = torch.arange(40.0)[torch.randperm(40, generator=stream(0))][:, None]
+    assert worst_mean(values, 0.05).tolist() == [38.5]
+    assert worst_mean(values[:3], 0.05).item() == values[:3].max().item()
+
+
+def test_input_figures_by_hand():
+    u = torch.tensor([[0.0, 1.0], [2.0, 1.0], [-1.0, 1.0]])[:, None]
+    batch = Trajectories(torch.zeros(4, 1, 2), torch.zeros(4, 1, 2), u, u)
+    found = input_figures(batch, torch.tensor([-1.0, -1.0]), torch.tensor([2.0, 3.0]))
+    assert found["total_variation"].tolist() == [5.0, 0.0]
+    assert found["at_bound"].tolist() == pytest.approx([2 / 3, 0.0])
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.6, 0.9])
+def test_the_harris_index_of_an_autoregression_is_known(memory):
+    """e_t = m e_(t-1) + w_t has variance var(w) / (1 - m^2), so that its index is 1 - m^2; an offset lowers it."""
+    noise = torch.randn(40_000, generator=stream(0, "harris"), dtype=torch.float64).numpy()
+    e = np.zeros_like(noise)
+    for t in range(1, len(e)):
+        e[t] = memory * e[t - 1] + noise[t]
+    assert harris_index(e, 20) == pytest.approx(1 - memory**2, rel=0.05)
+    assert harris_index(e + 2 * e.std(), 20) == pytest.approx((1 - memory**2) / 5, rel=0.06)

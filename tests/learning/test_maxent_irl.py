@@ -1,0 +1,279 @@
+"""Algorithm 2: the MaxEnt gradient against the log-likelihood itself, the ascent step, and the outer loop."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.learning.evaluation import expected_features
+from helpers.learning.features import linear_reward
+from helpers.learning.maxent_irl import WeightAscent, initial_weights, maxent_gradient, maxent_irl, project
+from helpers.learning.policy import LSTMPolicy, PolicyController
+from helpers.learning.reinforce import TrainingError
+from helpers.plant.rollout import rollout, stream
+
+F64 = torch.float64
+
+
+def normal(*shape, seed=0):
+    return torch.randn(*shape, generator=stream(seed, "test", *shape), dtype=F64)
+
+
+@pytest.fixture(scope="module")
+def weights_of(study):
+    """Parameters of the ascent as printed, with changes."""
+    base = study().params.learning.variants["printed"].weights
+    plain = {"step": 0.1, "decay": 0.0, "bound": 1.0, "scaled_by_expert": False, "averaging": 0.0, "keep_nearest": False}
+    return lambda **changes: base.model_copy(update={**plain, "selection_memory": 0.0, **changes})
+
+
+def differences(function, at, step=1e-6):
+    """Central differences of a scalar function."""
+    return np.array([(function(at + row) - function(at - row)) / (2 * step) for row in step * np.eye(len(at))])
+
+
+# The gradient
+
+
+@pytest.mark.equation("3.4.1")
+@pytest.mark.equation("3.4.4")
+@pytest.mark.equation("3.4.5")
+def test_the_gradient_is_that_of_the_mean_log_likelihood():
+    """Nine possible trajectories, so that the partition function is a sum; five demonstrations, some seen twice."""
+    features = normal(9, 4).numpy()
+    demonstrations = [0, 3, 3, 8, 5]
+    alpha = np.array([0.4, -0.7, 0.2, 0.55])
+
+    def log_likelihood(weights):
+        partition = sum(np.exp(weights @ v) for v in features)
+        return np.mean([weights @ features[k] - np.log(partition) for k in demonstrations])
+
+    probability = np.exp(features @ alpha) / np.exp(features @ alpha).sum()
+    found = maxent_gradient(torch.tensor(features[demonstrations].mean(0)), torch.tensor(probability @ features))
+    np.testing.assert_allclose(found, differences(log_likelihood, alpha), rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.equation("3.4.3")
+@pytest.mark.equation("3.4.6")
+def test_plain_ascent_reaches_matching_features():
+    """With p(tau|alpha) at hand the iteration of Eq. 3.4.6 ends where E_p[v] = v_E, the maximum of a concave function."""
+    features = normal(9, 3, seed=4)
+    target = 0.5 * features[2] + 0.3 * features[5] + 0.2 * features.mean(0)
+    alpha = torch.zeros(3, dtype=F64)
+    for _ in range(20_000):
+        probability = torch.softmax(features @ alpha, 0)
+        alpha = alpha + 0.2 * maxent_gradient(target, probability @ features)
+    torch.testing.assert_close(torch.softmax(features @ alpha, 0) @ features, target, rtol=1e-6, atol=1e-6)
+
+
+# The step
+
+
+@pytest.mark.equation("3.4.6")
+def test_one_printed_step_by_hand(weights_of):
+    # (0.6, 0.8) + 0.1 (2, -8) = (0.8, 0), of norm 0.8.
+    ascent = WeightAscent(weights_of(), torch.tensor([0.6, 0.8], dtype=F64), torch.ones(2, dtype=F64))
+    ascent.step(torch.tensor([2.0, -8.0], dtype=F64))
+    np.testing.assert_allclose(ascent.weights, [1.0, 0.0], atol=1e-14)
+
+
+@pytest.mark.equation("3.4.6")
+def test_the_step_is_clipped_before_it_is_normalised(weights_of):
+    # (0.6, -0.8, 0) + 0.1 (50, -50, 50) leaves the box on every side: three weights at one bound, as in Table 3.
+    ascent = WeightAscent(weights_of(bound=0.5), torch.tensor([0.6, -0.8, 0.0], dtype=F64), torch.ones(3, dtype=F64))
+    ascent.step(torch.tensor([50.0, -50.0, 50.0], dtype=F64))
+    np.testing.assert_allclose(ascent.weights, np.array([1, -1, 1]) / np.sqrt(3), rtol=1e-14)
+
+
+@pytest.mark.equation("3.4.6")
+@pytest.mark.parametrize("decay", [0.0, 0.3])
+@pytest.mark.parametrize("scaled", [False, True])
+@pytest.mark.parametrize("averaging", [0.0, 0.9])
+def test_weights_stay_finite_and_of_unit_norm(weights_of, decay, scaled, averaging):
+    params = weights_of(decay=decay, scaled_by_expert=scaled, averaging=averaging, bound=0.7)
+    ascent = WeightAscent(params, project(normal(6)), 20 * normal(6, seed=2))
+    for index in range(50):
+        ascent.step(30 * normal(6, seed=10 + index))
+        for weights in (ascent.weights, ascent.result):
+            assert weights.norm().item() == pytest.approx(1, rel=1e-12)
+        assert ascent.raw.abs().max() <= 0.7
+
+
+def test_decay_is_the_gradient_of_a_gaussian_prior(weights_of):
+    """The step moves along the gradient of the log-likelihood plus the log-density of the prior, -decay/(2 kappa) |lambda|^2."""
+    start, features, expert = project(normal(3)), normal(6, 3, seed=1), normal(3, seed=2)
+
+    def log_posterior(raw):
+        return raw @ expert.numpy() - np.log(np.exp(features.numpy() @ raw).sum()) - 0.2 / (2 * 0.01) * raw @ raw
+
+    ascent = WeightAscent(weights_of(step=0.01, decay=0.2, bound=10.0), start, torch.ones(3, dtype=F64))
+    ascent.step(maxent_gradient(expert, torch.softmax(features @ start, 0) @ features))
+    np.testing.assert_allclose((ascent.raw - start) / 0.01, differences(log_posterior, start.numpy()), rtol=1e-6, atol=1e-8)
+
+
+def test_scaling_measures_each_feature_in_units_of_the_experts(weights_of):
+    """Counting a feature in another unit leaves the scaled step in relative terms as it was."""
+    start, expert, policy = project(normal(3)), torch.tensor([20.0, -4.0, 0.5], dtype=F64), normal(3, seed=1)
+    ascent = WeightAscent(weights_of(scaled_by_expert=True, bound=10.0), start, expert)
+    ascent.step(maxent_gradient(expert, policy))
+    np.testing.assert_allclose(ascent.raw, (start + 0.1 * (expert - policy) / expert.abs()).numpy(), rtol=1e-12)
+
+
+def test_the_result_is_the_running_mean_of_the_weights(weights_of):
+    ascent = WeightAscent(weights_of(averaging=0.75), project(normal(4)), torch.ones(4, dtype=F64))
+    mean = ascent.weights
+    for index in range(5):
+        ascent.step(normal(4, seed=20 + index))
+        mean = 0.75 * mean + 0.25 * ascent.weights
+    torch.testing.assert_close(ascent.result, mean / mean.norm(), rtol=1e-12, atol=1e-14)
+
+
+def test_without_averaging_the_result_is_the_last_step(weights_of):
+    ascent = WeightAscent(weights_of(), project(normal(4)), torch.ones(4, dtype=F64))
+    for index in range(3):
+        ascent.step(normal(4, seed=20 + index))
+    torch.testing.assert_close(ascent.result, ascent.weights, rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("n_loops", [1, 2, 3])
+def test_initial_weights_give_one_sign_to_each_kind_of_feature(weights_of, n_loops):
+    found = initial_weights(weights_of(initial=(1.0, -1.0, -2.0)), n_loops, F64)
+    expected = np.repeat([1.0, -1.0, -2.0], n_loops) / np.sqrt(6 * n_loops)
+    np.testing.assert_allclose(found, expected, rtol=1e-14)
+
+
+# The outer loop
+
+
+def setting(case, n_episodes=6, total_epochs=6, seed=0, **changes):
+    """A learner, the expert's features and the first weights."""
+    params = case.params.learning.variants["printed"].learner.model_copy(update={"patience": 0, **changes})
+    learner = case.learner(case.policy(seed), n_episodes, total_epochs, params, seed)
+    expert = expected_features(case.process, case.pid, case.features, 20, stream(seed, "expert")).mean
+    return learner, expert, project(normal(len(expert)))
+
+
+@pytest.mark.parametrize(
+    ("total", "iterations", "shares"), [(6, 3, [2, 4, 6]), (7, 3, [2, 4, 7]), (4, 4, [1, 2, 3, 4]), (3, 1, [3])]
+)
+def test_epochs_are_shared_among_the_iterations_and_all_episodes_counted(study, weights_of, total, iterations, shares):
+    learner, expert, start = setting(study(), total_epochs=total)
+    seen = []
+    result = maxent_irl(learner, expert, start, weights_of(), iterations, 5, seen.append)
+    assert [record.epochs for record in result.records] == shares
+    assert [record.episodes for record in result.records] == [6 * done + 5 * (index + 1) for index, done in enumerate(shares)]
+    assert [record.gradient_steps for record in result.records] == shares
+    assert [record.iteration for record in result.records] == list(range(1, iterations + 1))
+    assert tuple(seen) == result.records
+
+
+def test_an_iteration_learns_under_the_weights_it_records(study, weights_of):
+    """The first return is that of the fresh policy's own batch under alpha_0; the next weights follow from Eq. 3.4.6."""
+    case = study()
+    learner, expert, start = setting(case, total_epochs=2)
+    batch = rollout(case.process, PolicyController(case.policy(), case.task, True), case.task, 6, stream(0, "learner"))
+    result = maxent_irl(learner, expert, start, weights_of(), 2, 5)
+    first, second = result.records
+    np.testing.assert_allclose(first.weights, start, rtol=1e-12)
+    expected = case.features.trajectory(batch).mean(0) @ start
+    assert first.mean_return == pytest.approx(expected.item(), rel=1e-10)
+    stepped = np.clip(start.numpy() + 0.1 * (expert - measured_after(case, first)).numpy(), -1, 1)
+    np.testing.assert_allclose(second.weights, stepped / np.linalg.norm(stepped), rtol=1e-10)
+
+
+def measured_after(case, record):
+    """E[v] of the deployed policy after the first iteration of the run above, from the same draws."""
+    learner, expert, start = setting(case, total_epochs=2)
+    assert learner.total_epochs == 2 * record.epochs
+    learner.epoch(lambda batch: linear_reward(case.features.state(batch), start))
+    controller = PolicyController(learner.policy, case.task, exploring=False)
+    found = expected_features(case.process, controller, case.features, 5, learner.generator).mean
+    gap = ((found - expert).abs() / expert.abs()).mean().item()
+    assert record.feature_gap == pytest.approx(gap, rel=1e-10)
+    return found
+
+
+def test_the_result_is_reproducible_bit_for_bit(study, weights_of):
+    case = study(1, torch.float32)
+
+    def run():
+        learner, expert, start = setting(case, total_epochs=3)
+        return maxent_irl(learner, expert, start.float(), weights_of(scaled_by_expert=True), 3, 5)
+
+    first, second = run(), run()
+    assert first.records == second.records
+    assert torch.equal(first.weights, second.weights)
+    assert all(torch.equal(a, b) for a, b in zip(first.policy.parameters(), second.policy.parameters(), strict=True))
+
+
+def test_the_nearest_epoch_is_kept_where_asked(study, weights_of):
+    case, n_epochs = study(), 6
+
+    def run(keep):
+        learner, expert, start = setting(case, total_epochs=n_epochs, learning_rate_start=0.05, learning_rate_end=0.05)
+        return learner, maxent_irl(learner, expert, start, weights_of(keep_nearest=keep), n_epochs, 5)
+
+    learner, last = run(False)
+    gaps = [record.feature_gap for record in last.records]
+    assert last.chosen_epoch == n_epochs
+    assert all(torch.equal(a, b) for a, b in zip(last.policy.parameters(), learner.policy.parameters(), strict=True))
+    _, nearest = run(True)
+    assert [record.feature_gap for record in nearest.records] == gaps
+    assert nearest.chosen_epoch == 1 + int(np.argmin(gaps)) < n_epochs  # an earlier epoch, so that the choice shows
+
+
+def test_learning_goes_on_without_touching_the_kept_policy(study, weights_of):
+    learner, expert, start = setting(study())
+    result = maxent_irl(learner, expert, start, weights_of(), 2, 5)
+    before = [parameter.detach().clone() for parameter in result.policy.parameters()]
+    learner.epoch(lambda batch: batch.x[1:, :, 0])
+    assert all(torch.equal(a, b) for a, b in zip(result.policy.parameters(), before, strict=True))
+
+
+def test_early_stopping_ends_an_iteration_early(study, weights_of):
+    learner, expert, start = setting(study(), total_epochs=20, patience=1, learning_rate_start=1e-5, learning_rate_end=1e-5)
+    result = maxent_irl(learner, expert, start, weights_of(), 2, 5)
+    assert result.records[-1].epochs < 20
+
+
+def test_features_come_nearer_the_experts(study, weights_of):
+    """A short run of the improved variant on Case Study I, from a policy that leaves the inputs near zero."""
+    case = study(1, torch.float32)
+    variant = case.params.learning.variants["improved"]
+    expert = expected_features(case.process, case.pid, case.features, 200, stream(0, "expert")).mean
+    learner = case.learner(case.policy(), 100, 40, variant.learner)
+    start = initial_weights(variant.weights, 2, torch.float32)
+    gaps = [record.feature_gap for record in maxent_irl(learner, expert, start, variant.weights, 40, 50).records]
+    assert np.mean(gaps[-5:]) < 0.5 * gaps[0]
+
+
+@pytest.mark.parametrize(("n_controlled", "n_manipulated"), [(1, 1), (3, 3), (3, 2)])
+@pytest.mark.parametrize("variant", ["improved", "printed"])
+def test_any_number_of_variables_and_features(synthetic, n_controlled, n_manipulated, variant):
+    case = synthetic(n_controlled, n_manipulated)
+    params = case.params.learning.variants[variant]
+    learner = case.learner(case.policy(), 8, 4, params.learner)
+    expert = torch.linspace(1, 2, 3 * n_controlled, dtype=F64)
+    result = maxent_irl(learner, expert, initial_weights(params.weights, n_controlled, F64), params.weights, 4, 5)
+    assert result.weights.shape == (3 * n_controlled,)
+    assert isinstance(result.policy, LSTMPolicy)
+    assert all(len(record.weights) == 3 * n_controlled for record in result.records)
+    assert all(later.epochs == earlier.epochs + 1 for earlier, later in pairwise(result.records))
+
+
+def test_features_that_are_not_finite_end_training_with_the_epoch(study, weights_of):
+    case = study()
+    learner, expert, start = setting(case)
+    calls = []
+
+    class Failing(type(case.process)):
+        def step(self, x, u, noise):
+            calls.append(1)
+            return super().step(x, u, noise) * (float("nan") if len(calls) > 2 * case.task.n_steps else 1)
+
+    learner.process = Failing(case.params.process, F64)
+    with pytest.raises(
+        TrainingError, match=r"epoch 2: .*not finite"
+    ):  # two epochs of learning pass, the evaluation after them fails
+        maxent_irl(learner, expert, start, weights_of(), 3, 5)

@@ -1,0 +1,287 @@
+"""The LSTM policy against a plain numpy network, probability densities of scipy and torch, and its fast stepping."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import norm
+
+from helpers.learning.policy import LSTMPolicy, PolicyController, entropy
+from helpers.plant.rollout import rollout, stream
+from helpers.settings.paper import ExplorationParams
+
+F64 = torch.float64
+
+
+def stirred(policy, factor=2.0, seed=5):
+    """The policy with larger weights, the exploration's included, so that gates, kinks and the ends of ReLU6 are all met."""
+    with torch.no_grad():
+        weight = policy.output.weight
+        rows = weight[policy.n_manipulated :]
+        rows.copy_(torch.randn(rows.shape, generator=stream(seed), dtype=rows.dtype) / 5)
+        for name, parameter in policy.named_parameters():
+            if name != "output.bias":  # it keeps the outputs near the middle of ReLU6
+                parameter.mul_(10 * factor if name == "output.weight" else factor)
+    return policy
+
+
+def numpy_forward(policy, y, u, task):
+    """Mean and standard deviation by the textbook LSTM, one step, layer and gate at a time."""
+    numbers = {name: value.detach().double().numpy() for name, value in policy.named_parameters()}
+    low, high, set_point = (getattr(task, name).double().numpy() for name in ("input_low", "input_high", "set_point"))
+    y, u = y.double().numpy(), u.double().numpy()
+    params, n_steps, n_batch, n_inputs = policy.params, *u.shape
+    hidden = [np.zeros((n_batch, width)) for width in params.hidden_cells]
+    cell = [np.zeros((n_batch, width)) for width in params.hidden_cells]
+    means, deviations = np.empty_like(u), np.empty_like(u)
+    for t in range(n_steps):
+        before = u[t - 1] if t else np.zeros((n_batch, n_inputs))
+        signal = np.hstack([(set_point - y[t]) / np.array(params.error_unit), (2 * before - low - high) / (high - low)])
+        for layer, width in enumerate(params.hidden_cells):
+            w_in, w_rec, b_in, b_rec = (
+                numbers[f"layers.{layer}.{kind}_l0"] for kind in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+            )
+            total = signal @ w_in.T + b_in + hidden[layer] @ w_rec.T + b_rec
+            gate_i, gate_f, candidate, gate_o = (total[:, part * width : (part + 1) * width] for part in range(4))
+            gate_i, gate_f, gate_o = (1 / (1 + np.exp(-gate)) for gate in (gate_i, gate_f, gate_o))
+            cell[layer] = gate_f * cell[layer] + gate_i * np.tanh(candidate)
+            hidden[layer] = gate_o * np.tanh(cell[layer])  # the recurrence sees it without the leaky ReLU
+            signal = np.where(hidden[layer] > 0, hidden[layer], params.leaky_slope * hidden[layer])
+        z = signal @ numbers["output.weight"].T + numbers["output.bias"]
+        share = np.minimum(np.maximum(0, z), 6) / 6  # Eq. 3.2.5
+        means[t] = low + (high - low) * share[:, :n_inputs]
+        deviations[t] = (high - low) * (params.std_low + (params.std_high - params.std_low) * share[:, n_inputs:])
+    return means, deviations
+
+
+def episodes(case, policy, exploring=True, n=7, seed=0):
+    return rollout(case.process, PolicyController(policy, case.task, exploring), case.task, n, stream(seed, "episodes"))
+
+
+@pytest.mark.equation("3.2.5")
+def test_the_output_layer_is_relu6_mapped_to_the_bounds(study):
+    case = study()
+    policy, task = case.policy(std_low=0.1, initial_std=0.2, std_high=0.7), case.task
+    z = torch.linspace(-4, 10, 57, dtype=F64)[:, None].repeat(1, 4)
+    mean, std = (part.detach().numpy() for part in policy.scale(z, task))
+    relu6 = np.minimum(np.maximum(0, z.numpy()), 6)[:, :2]
+    low, span = task.input_low.numpy(), (task.input_high - task.input_low).numpy()
+    np.testing.assert_allclose(mean, low + span * relu6 / 6, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(std, span * (0.1 + 0.6 * relu6 / 6), rtol=1e-13)
+
+
+@pytest.mark.parametrize("hidden_cells", [(20, 20), (3,), (4, 7, 2)], ids=str)
+@pytest.mark.parametrize("leaky_slope", [0.01, 0.3])
+def test_forward_is_the_textbook_lstm_with_leaky_relu_on_each_output(study, hidden_cells, leaky_slope):
+    case = study()
+    policy = stirred(case.policy(hidden_cells=hidden_cells, leaky_slope=leaky_slope))
+    batch = episodes(case, policy)
+    mean, std = policy(batch.y, batch.u, case.task)
+    expected = numpy_forward(policy, batch.y, batch.u, case.task)
+    np.testing.assert_allclose(mean.detach(), expected[0], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(std.detach(), expected[1], rtol=0, atol=1e-10)
+    assert mean.std(0).min() > 1e-2  # the comparison is not one of constants
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (F64, 1e-12)])
+@pytest.mark.parametrize("exploring", [True, False])
+@pytest.mark.parametrize("factor", [1.0, 3.0])
+def test_fast_stepping_agrees_with_forward_along_whole_trajectories(study, dtype, tolerance, exploring, factor):
+    case = study(1, dtype)
+    policy = stirred(case.policy(), factor)
+    batch = episodes(case, policy, n=50)
+    controller = PolicyController(policy, case.task, exploring)
+    memory = controller.start(50, 50, stream(0, "replay"))
+    u = torch.empty_like(batch.u)
+    command = torch.empty_like(batch.u)
+    for t in range(50):
+        command[t], memory = controller.act(batch.y[t], memory)
+        u[t] = command[t].clamp(case.task.input_low, case.task.input_high)
+    mean, std = (part.detach() for part in policy(batch.y, u, case.task))
+    expected = mean + std * torch.stack(memory.exploration).mT if exploring else mean
+    span = case.task.input_high - case.task.input_low
+    assert ((command - expected) / span).abs().max() < tolerance
+
+
+def test_the_mode_has_no_noise_and_exploring_has_the_stated_spread(study):
+    case = study()
+    policy = case.policy()
+    controller = PolicyController(policy, case.task, exploring=True)
+    y = torch.zeros(40_000, 2, dtype=F64)
+    command, _ = controller.act(y, controller.start(len(y), 1, stream(0, "spread")))
+    deployed = PolicyController(policy, case.task, exploring=False)
+    mode, _ = deployed.act(y, deployed.start(len(y), 1, stream(0)))
+    span = case.task.input_high - case.task.input_low
+    assert ((mode - mode[0]).abs() / span).max() < 1e-12  # a product may round one column otherwise than the next
+    share = ((command - mode) / span).numpy()
+    spread = policy.params.initial_std
+    np.testing.assert_array_less(np.abs(share.mean(0)), 5 * spread / np.sqrt(len(y)))
+    np.testing.assert_allclose(share.std(0), spread, rtol=5 / np.sqrt(2 * len(y)))
+
+
+@pytest.mark.equation("3.2.3")
+def test_log_probability_is_that_of_independent_normal_inputs(study):
+    case = study()
+    policy = stirred(case.policy())
+    batch = episodes(case, policy)
+    found = policy.log_probability(batch.y, batch.u, batch.command, case.task).detach()
+    mean, std = numpy_forward(policy, batch.y, batch.u, case.task)
+    np.testing.assert_allclose(found, norm.logpdf(batch.command.numpy(), mean, std).sum(-1), rtol=0, atol=1e-9)
+    with torch.no_grad():
+        normal = torch.distributions.Normal(*policy(batch.y, batch.u, case.task))
+    torch.testing.assert_close(found, normal.log_prob(batch.command).sum(-1), rtol=1e-12, atol=1e-12)
+    assert found.shape == (50, 7)
+
+
+def test_entropy_is_that_of_inputs_measured_by_their_range(study):
+    task = study().task
+    std = torch.rand(4, 3, 2, generator=stream(0), dtype=F64) + 0.1
+    expected = norm.entropy(scale=std.numpy() / (task.input_high - task.input_low).numpy()).sum(-1)
+    np.testing.assert_allclose(entropy(std, task), expected, rtol=1e-12)
+
+
+@pytest.mark.equation("3.1.6")
+@pytest.mark.equation("3.2.3")
+def test_only_the_policy_contributes_to_the_gradient_of_a_trajectorys_probability(study):
+    """Finite differences of the whole density p(x_0) p(y_0|x_0) prod pi p(x'|x, u) p(y'|x'), written with scipy."""
+    case = study()
+    policy = case.policy(leaky_slope=0.3)
+    batch = episodes(case, policy, n=1)
+    x, y, u, command = (getattr(batch, name)[:, 0].numpy() for name in ("x", "y", "u", "command"))
+    params, start = case.params.process, case.task
+    drift = x[:-1] @ np.array(params.drift_state).T + u @ np.array(params.drift_input).T
+    kick = np.abs(np.array(params.disturbance) * x[:-1]) * params.sampling_time**0.5
+    world = (
+        norm.logpdf(x[0], start.initial_mean, start.initial_std).sum()
+        + norm.logpdf(y, x, np.abs(x) * np.array(params.observation_noise)).sum()
+        + norm.logpdf(x[1:], x[:-1] + drift * params.sampling_time, kick).sum()
+    )
+
+    def log_density():
+        mean, std = numpy_forward(policy, batch.y, batch.u, case.task)
+        return world + norm.logpdf(command, mean[:, 0], std[:, 0]).sum()
+
+    policy.log_probability(batch.y, batch.u, batch.command, case.task).sum().backward()
+    for parameter in policy.parameters():
+        values, gradient = parameter.detach().view(-1), parameter.grad.view(-1)
+        for index in (0, len(values) // 2, int(gradient.abs().argmax())):
+            middle, sides = values[index].item(), []
+            for shift in (1e-5, -1e-5):
+                values[index] = middle + shift
+                sides.append(log_density())
+            values[index] = middle
+            assert (sides[0] - sides[1]) / 2e-5 == pytest.approx(gradient[index].item(), rel=1e-4, abs=1e-4)
+
+
+@pytest.mark.parametrize(("low", "high"), [((-20.0, -60.0), (20.0, 60.0)), ((-1.0, -5.0), (9.0, 95.0))])
+def test_a_fresh_policy_asks_for_inputs_near_the_steady_state(study, low, high):
+    case = study(process={"input_low": low, "input_high": high})
+    span = np.subtract(high, low)
+    for seed in range(5):
+        policy = case.policy(seed)
+        batch = episodes(case, policy, exploring=False, n=20)
+        assert (np.abs(batch.command.numpy().mean((0, 1))) / span < 0.1).all()
+        _, std = policy(batch.y, batch.u, case.task)
+        np.testing.assert_allclose(std.detach().numpy() / span, policy.params.initial_std, rtol=1e-12)
+        with torch.no_grad():
+            policy.output.weight.zero_()
+        np.testing.assert_allclose(policy(batch.y, batch.u, case.task)[0].detach(), 0, atol=1e-12 * span.max())
+
+
+def test_means_and_inputs_stay_inside_the_bounds(study):
+    case = study()
+    policy = stirred(case.policy(), 10.0)
+    batch = episodes(case, policy, n=50)
+    mean, std = policy(batch.y, batch.u, case.task)
+    span = case.task.input_high - case.task.input_low
+    assert (mean == case.task.input_low).any()
+    assert (mean == case.task.input_high).any()
+    for signal in (mean, batch.u):
+        assert (signal >= case.task.input_low).all()
+        assert (signal <= case.task.input_high).all()
+    assert (std >= policy.params.std_low * span * (1 - 1e-12)).all()
+    assert (std <= policy.params.std_high * span * (1 + 1e-12)).all()
+
+
+def test_reset_exploration_restores_the_spread_and_keeps_the_mean(study):
+    case = study()
+    policy = stirred(case.policy())
+    batch = episodes(case, policy)
+    before = policy(batch.y, batch.u, case.task)
+    policy.reset_exploration()
+    after = policy(batch.y, batch.u, case.task)
+    span = case.task.input_high - case.task.input_low
+    assert torch.equal(before[0], after[0])
+    assert not torch.allclose(before[1], after[1])
+    torch.testing.assert_close(after[1], (policy.params.initial_std * span).expand_as(after[1]), rtol=1e-12, atol=0)
+
+
+def test_reset_exploration_takes_new_limits_and_keeps_the_mean(study):
+    case = study()
+    policy = stirred(case.policy())
+    batch = episodes(case, policy)
+    before = policy(batch.y, batch.u, case.task)
+    policy.reset_exploration(ExplorationParams.model_construct(std_low=0.1, std_high=0.9, initial_std=0.3))
+    mean, std = policy(batch.y, batch.u, case.task)
+    span = case.task.input_high - case.task.input_low
+    assert torch.equal(before[0], mean)
+    torch.testing.assert_close(std, (0.3 * span).expand_as(std), rtol=1e-12, atol=0)
+    with torch.no_grad():
+        policy.output.bias[policy.n_manipulated :] = 99.0
+    torch.testing.assert_close(policy(batch.y, batch.u, case.task)[1], (0.9 * span).expand_as(std), rtol=1e-12, atol=0)
+
+
+def test_the_policy_sees_the_past_and_nothing_later(study):
+    case = study()
+    policy = stirred(case.policy())
+    batch = episodes(case, policy)
+    mean = policy(batch.y, batch.u, case.task)[0]
+    y, u = batch.y.clone(), batch.u.clone()
+    y[21:] += 1
+    u[20:] = -u[20:]  # u_20 itself may not shape the distribution that it is drawn from
+    changed = policy(y, u, case.task)[0]
+    assert torch.equal(mean[:21], changed[:21])
+    assert not torch.allclose(mean[21:], changed[21:])
+
+
+def test_episodes_do_not_share_memory(study):
+    case = study()
+    controller = PolicyController(stirred(case.policy()), case.task, exploring=True)
+    first = rollout(case.process, controller, case.task, 5, stream(0, "again"))
+    rollout(case.process, controller, case.task, 9, stream(1, "again"))  # another batch with the same controller object
+    assert torch.equal(first.command, rollout(case.process, controller, case.task, 5, stream(0, "again")).command)
+
+
+def test_trajectories_of_a_batch_do_not_see_each_other(study):
+    case = study()
+    policy = stirred(case.policy())
+    y = torch.randn(10, 6, 2, generator=stream(0, "y"), dtype=F64)
+
+    def commands(observations):
+        controller = PolicyController(policy, case.task, exploring=False)
+        memory, found = controller.start(observations.shape[1], 10, stream(0)), []
+        for observation in observations:
+            command, memory = controller.act(observation, memory)
+            found.append(command.clone())
+        return torch.stack(found)
+
+    together = commands(y)
+    for row in range(6):
+        torch.testing.assert_close(together[:, row : row + 1], commands(y[:, row : row + 1]), rtol=1e-12, atol=1e-10)
+
+
+def test_fresh_policies_depend_on_the_generator_alone(study):
+    case = study()
+    torch.manual_seed(1)
+    first = case.policy(3).state_dict()
+    torch.manual_seed(2)
+    second = case.policy(3).state_dict()
+    other = case.policy(4).state_dict()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert not torch.equal(first["layers.0.weight_ih_l0"], other["layers.0.weight_ih_l0"])
+
+
+def test_the_paper_network_has_two_layers_of_twenty_cells(study):
+    policy = study().policy()
+    assert isinstance(policy, LSTMPolicy)
+    assert [layer.hidden_size for layer in policy.layers] == [20, 20]
+    assert policy.output.out_features == 4

@@ -1,0 +1,485 @@
+"""Algorithm 1: returns, baselines, the policy gradient against exact integration, and the learner's book-keeping."""
+
+import copy
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.learning.policy import PolicyController
+from helpers.learning.reinforce import (
+    Learner,
+    TrainingError,
+    annealed,
+    baseline_regressors,
+    clipped_surrogate,
+    discounted_return,
+    regression_advantage,
+    reinforce,
+    reward_to_go,
+    surrogate,
+    whole_return_advantage,
+)
+from helpers.plant.process import LinearProcess
+from helpers.plant.rollout import rollout, stream
+
+F64 = torch.float64
+
+
+def normal(*shape, seed=0):
+    return torch.randn(*shape, generator=stream(seed, "test", *shape), dtype=F64)
+
+
+@pytest.fixture(scope="module")
+def settings(study):
+    """Learner parameters of the printed variant, with changes."""
+    base = study().params.learning.variants["printed"].learner
+    return lambda **changes: base.model_copy(update={"patience": 0, **changes})
+
+
+# Returns and baselines
+
+
+@pytest.mark.equation("3.1.5")
+def test_return_by_plain_loops():
+    rewards = normal(6, 3)
+    expected = [sum(0.9 ** (t - 1) * rewards[t - 1, k].item() for t in range(1, 7)) for k in range(3)]
+    np.testing.assert_allclose(discounted_return(rewards, 0.9), expected, rtol=1e-13)
+
+
+@pytest.mark.equation("3.1.5")
+def test_return_of_a_constant_reward_is_a_geometric_sum():
+    found = discounted_return(torch.full((50, 1), 3.0, dtype=F64), 0.99).item()
+    assert found == pytest.approx(3 * (1 - 0.99**50) / 0.01, rel=1e-12)
+
+
+@pytest.mark.parametrize("decay", [1.0, 0.6])
+def test_reward_to_go_by_plain_loops(decay):
+    rewards = normal(5, 2)
+    found = reward_to_go(rewards, 0.8, decay)
+    for t in range(5):  # the input u_t meets R_{t+1}..R_T, rows t..T-1
+        for k in range(2):
+            expected = sum(0.8**row * decay ** (row - t) * rewards[row, k].item() for row in range(t, 5))
+            assert found[t, k].item() == pytest.approx(expected, rel=1e-12)
+
+
+def test_reward_to_go_from_the_start_is_the_return():
+    rewards = normal(5, 2)
+    found = reward_to_go(rewards, 0.8)
+    torch.testing.assert_close(found[0], discounted_return(rewards, 0.8), rtol=1e-12, atol=1e-12)
+
+
+def test_whole_return_less_its_mean():
+    rewards = normal(5, 4)
+    found, value = whole_return_advantage(rewards, 0.8), discounted_return(rewards, 0.8).numpy()
+    np.testing.assert_allclose(found, np.tile(value - value.mean(), (5, 1)), rtol=1e-12, atol=1e-12)
+
+
+def test_regression_advantage_is_the_residual_of_ridge_regression():
+    """Ridge regression is least squares with rows sqrt(ridge) I and zeros below the data."""
+    rewards, regressors, n = normal(4, 30), normal(4, 30, 2, seed=1), 30
+    found = regression_advantage(rewards, 0.9, decay=0.7, regressors=regressors)
+    future = reward_to_go(rewards, 0.9, 0.7).numpy()
+    for t in range(4):
+        design = np.column_stack([np.ones(n), regressors[t]])
+        below = np.sqrt(1e-3 * n) * np.eye(3)
+        fit = np.linalg.lstsq(np.vstack([design, below]), np.concatenate([future[t], np.zeros(3)]), rcond=None)[0]
+        np.testing.assert_allclose(found[t], future[t] - design @ fit, rtol=1e-9, atol=1e-10)
+
+
+def test_regression_advantage_explains_what_the_past_determines():
+    past = normal(1, 4000, 2)
+    rewards = 100 + past[..., 0] * 3 - 2 * past[..., 1] + 0.1 * normal(1, 4000)
+    assert regression_advantage(rewards, 1.0, decay=1.0, regressors=past).std() < 0.12 < 0.1 * rewards.std()
+
+
+def test_regression_advantage_survives_regressors_that_are_all_alike():
+    alike = torch.zeros(3, 20, 4, dtype=F64)
+    assert torch.isfinite(regression_advantage(normal(3, 20), 0.9, decay=1.0, regressors=alike)).all()
+
+
+def test_the_baseline_looks_at_nothing_later_than_the_observation(study):
+    case = study()
+    batch = rollout(case.process, case.pid, case.task, 5, stream(0))
+    late = type(batch)(batch.x, batch.y.clone(), batch.u.clone(), batch.command.clone())
+    late.y[21:] += 1
+    late.u[20:] += 1
+    late.command[20:] += 1
+    before, after = baseline_regressors(batch, case.features), baseline_regressors(late, case.features)
+    assert torch.equal(before[:21], after[:21])
+    assert not torch.equal(before[21:], after[21:])
+
+
+# The policy gradient by exact integration: two steps, one input, no other randomness
+
+
+class Grid(PolicyController):
+    """A policy whose exploration runs over the nodes of a quadrature instead of being drawn."""
+
+    def __init__(self, policy, task, nodes):
+        super().__init__(policy, task, exploring=True)
+        self.nodes = nodes
+
+    def start(self, n_trajectories, n_steps, generator):
+        memory = super().start(n_trajectories, n_steps, generator)
+        memory.exploration = self.nodes.mT.unbind(0)
+        return memory
+
+
+class Integral:
+    """J(theta) = E[G] of a two-step problem by Gauss-Hermite quadrature over both exploration draws.
+
+    The leaky ReLU is made linear, so that the integrand is smooth and the quadrature exact to rounding.
+    """
+
+    gamma = 0.9
+
+    def __init__(self, synthetic):
+        case = synthetic(1, 1, n_steps=2, noise=0.0)
+        self.task, self.features, self.process = case.task, case.features, case.process
+        self.policy = case.policy(hidden_cells=(3, 2), leaky_slope=1.0)
+        with torch.no_grad():  # the spread and its gradient should depend on the history too
+            self.policy.output.weight.copy_(normal(2, 2))
+        nodes, weights = np.polynomial.hermite_e.hermegauss(24)
+        first, second = np.meshgrid(nodes, nodes, indexing="ij")
+        self.nodes = torch.tensor(np.stack([first.ravel(), second.ravel()])[..., None])
+        self.weights = torch.tensor(np.outer(weights, weights).ravel() / weights.sum() ** 2)
+
+    def batch(self):
+        return rollout(self.process, Grid(self.policy, self.task, self.nodes), self.task, len(self.weights), stream(0))
+
+    def rewards(self, batch):
+        return torch.cos(3 * batch.x[1:, :, 0]) + batch.x[1:, :, 0] ** 3
+
+    def value(self):
+        rewards = self.rewards(self.batch())
+        return (self.weights @ (rewards[0] + self.gamma * rewards[1])).item()
+
+    def gradient(self, advantage, objective=surrogate):
+        """The exact expectation of the estimator: each trajectory counts by its probability, not by 1/K."""
+        batch = self.batch()
+        log_probability = self.policy.log_probability(batch.y, batch.u, batch.command, self.task)
+        weighted = advantage(self.rewards(batch), batch) * self.weights * len(self.weights)
+        self.policy.zero_grad()
+        objective(log_probability, weighted).backward()
+        return torch.cat([parameter.grad.flatten() for parameter in self.policy.parameters()]).numpy().copy()
+
+    def finite_differences(self, step=1e-4):
+        found = []
+        for parameter in self.policy.parameters():
+            flat = parameter.detach().view(-1)
+            for index in range(len(flat)):
+                middle = flat[index].item()
+                flat[index] = middle + step
+                above = self.value()
+                flat[index] = middle - step
+                found.append((above - self.value()) / (2 * step))
+                flat[index] = middle
+        return np.array(found)
+
+
+ADVANTAGES = {
+    "whole return": lambda problem: lambda rewards, batch: discounted_return(rewards, problem.gamma).expand_as(rewards),
+    "scalar baseline": lambda problem: lambda rewards, batch: whole_return_advantage(rewards, problem.gamma),
+    "reward to go": lambda problem: lambda rewards, batch: reward_to_go(rewards, problem.gamma),
+    "regression baseline": lambda problem: (
+        lambda rewards, batch: regression_advantage(
+            rewards, problem.gamma, decay=1.0, regressors=baseline_regressors(batch, problem.features)
+        )
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def problem(synthetic):
+    found = Integral(synthetic)
+    found.exact = found.finite_differences()
+    return found
+
+
+@pytest.mark.equation("3.2.1")
+@pytest.mark.equation("3.2.4")
+@pytest.mark.parametrize("name", ADVANTAGES)
+def test_the_surrogates_gradient_is_that_of_the_expected_return_whatever_the_baseline(problem, name):
+    found = problem.gradient(ADVANTAGES[name](problem))
+    assert np.abs(problem.exact).max() > 0.05
+    np.testing.assert_allclose(found, problem.exact, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.equation("3.2.4")
+def test_the_clipped_surrogate_has_the_same_gradient_where_the_batch_was_drawn(problem):
+    def objective(log_probability, advantage):
+        return clipped_surrogate(log_probability, log_probability.detach(), advantage, 0.2)
+
+    found = problem.gradient(ADVANTAGES["reward to go"](problem), objective)
+    np.testing.assert_allclose(found, problem.exact, rtol=1e-5, atol=1e-7)
+
+
+def test_the_surrogate_by_plain_loops():
+    advantage, log_probability = normal(4, 3), normal(4, 3, seed=1)
+    expected = sum(advantage[t, k] * log_probability[t, k] for t in range(4) for k in range(3)) / 3
+    assert surrogate(log_probability, advantage).item() == pytest.approx(expected.item(), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "advantage", "value", "slope"),
+    [(1.1, 1.0, 1.1, 1.1), (1.5, 1.0, 1.2, 0.0), (1.5, -1.0, -1.5, -1.5), (0.5, 1.0, 0.5, 0.5), (0.5, -1.0, -0.8, 0.0)],
+)
+def test_the_ratio_is_clipped_only_where_it_has_gone_too_far(ratio, advantage, value, slope):
+    log_probability = torch.tensor([[np.log(ratio)]], dtype=F64, requires_grad=True)
+    found = clipped_surrogate(log_probability, torch.zeros(1, 1, dtype=F64), torch.tensor([[advantage]], dtype=F64), 0.2)
+    found.backward()
+    assert found.item() == pytest.approx(value, rel=1e-12)
+    assert log_probability.grad.item() == pytest.approx(slope, rel=1e-12)
+
+
+# The learner
+
+
+def closeness_reward(case, beta=1.0):
+    return lambda batch: case.features.tracking(batch, beta)
+
+
+@pytest.mark.equation("3.2.2")
+def test_the_first_step_climbs_the_gradient(study, settings):
+    """Adam's first step moves every parameter by the learning rate in the direction of its gradient's sign."""
+    case = study()
+    policy = case.policy()
+    before = {name: value.detach().clone() for name, value in policy.named_parameters()}
+    learner = case.learner(policy, 20, 1, settings(learning_rate_start=1e-6, learning_rate_end=1e-6))
+    batch = rollout(case.process, PolicyController(policy, case.task, True), case.task, 20, stream(0, "learner"))
+    advantage = whole_return_advantage(closeness_reward(case)(batch), 0.99)
+    surrogate(policy.log_probability(batch.y, batch.u, batch.command, case.task), advantage / advantage.std()).backward()
+    gradient = {name: value.grad.clone() for name, value in policy.named_parameters()}
+    learner.epoch(closeness_reward(case))
+    for name, value in policy.named_parameters():
+        clear = gradient[name].abs() > 1e-4  # Adam's small constant shortens the step where the gradient is tiny
+        torch.testing.assert_close(
+            (value.detach() - before[name])[clear], 1e-6 * gradient[name].sign()[clear], rtol=1e-3, atol=1e-11
+        )
+
+
+@pytest.mark.parametrize(("passes", "minibatches"), [(1, 1), (1, 4), (3, 2)])
+def test_epochs_episodes_and_gradient_steps_are_counted(study, settings, passes, minibatches):
+    case = study()
+    learner = case.learner(case.policy(), 8, 3, settings(passes=passes, minibatches=minibatches))
+    records = reinforce(learner, closeness_reward(case), 3)
+    assert (len(records), learner.epochs, learner.episodes, learner.gradient_steps) == (3, 3, 24, 3 * passes * minibatches)
+
+
+def test_a_second_pass_starts_from_the_policy_that_the_first_one_left(study, settings):
+    """Two passes over one batch, against two clipped steps written out with plain autograd."""
+    case = study()
+    policy = case.policy()
+    reference, optimiser = copy.deepcopy(policy), None
+    reward, task = closeness_reward(case), case.task
+    params = settings(passes=2, minibatches=1, learning_rate_start=1e-2, credit="whole_return", averaging=0.0, ratio_clip=0.05)
+    learner = case.learner(policy, 12, 2, params)
+    batch = rollout(case.process, PolicyController(reference, task, True), task, 12, stream(0, "learner"))
+    advantage = whole_return_advantage(reward(batch), 0.99)
+    advantage = advantage / advantage.std()
+    optimiser = torch.optim.Adam(reference.parameters(), lr=1e-2)
+    drawn = None
+    for _ in range(2):
+        mean, std = reference(batch.y, batch.u, task)
+        log_probability = torch.distributions.Normal(mean, std).log_prob(batch.command).sum(-1)
+        drawn = log_probability.detach() if drawn is None else drawn
+        ratio = (log_probability - drawn).exp()
+        gain = torch.minimum(ratio * advantage, ratio.clamp(0.95, 1.05) * advantage).sum(0).mean()
+        optimiser.zero_grad()
+        (-gain).backward()
+        optimiser.step()
+    learner.epoch(reward)
+    for value, expected in zip(learner.policy.parameters(), reference.parameters(), strict=True):
+        torch.testing.assert_close(value.detach(), expected.detach(), rtol=1e-6, atol=1e-7)
+
+
+def test_the_record_of_an_epoch_is_that_of_its_batch(study, settings):
+    case = study()
+    policy = case.policy()
+    batch = rollout(case.process, PolicyController(policy, case.task, True), case.task, 20, stream(0, "learner"))
+    returns = discounted_return(closeness_reward(case)(batch), 0.99)
+    record = case.learner(policy, 20, 1, settings()).epoch(closeness_reward(case))
+    assert record.mean_return == pytest.approx(returns.mean().item(), rel=1e-12)
+    assert record.standard_error == pytest.approx(returns.numpy().std(ddof=1) / np.sqrt(20), rel=1e-12)
+    assert record.policy_std == pytest.approx(policy.params.initial_std, rel=0.2)  # in units of the input range, after one step
+
+
+def test_the_learning_rate_falls_along_half_a_cosine(study, settings):
+    assert [annealed(3.0, 1.0, progress) for progress in (0.0, 0.5, 1.0)] == pytest.approx([3.0, 2.0, 1.0], rel=1e-14)
+    case = study()
+    learner = case.learner(case.policy(), 4, 5, settings(learning_rate_start=4e-3, learning_rate_end=1e-3))
+    rates = [record.learning_rate for record in reinforce(learner, closeness_reward(case), 5)]
+    assert rates[0] == pytest.approx(4e-3)
+    assert rates[-1] == pytest.approx(1e-3)
+    assert all(later < earlier for earlier, later in pairwise(rates))
+
+
+@pytest.mark.parametrize("averaging", [0.0, 0.5, 0.9])
+def test_the_average_is_a_running_mean_of_the_weights(study, settings, averaging):
+    """Every average stays inside the range that the weights have spanned; without averaging it is the last policy."""
+    case = study()
+    learner = case.learner(case.policy(), 8, 6, settings(averaging=averaging))
+    history = [learner.policy.output.bias.detach().clone()]
+    for _ in range(6):
+        learner.epoch(closeness_reward(case))
+        history.append(learner.policy.output.bias.detach().clone())
+    average, span = learner.average.output.bias.detach(), torch.stack(history)
+    if averaging == 0:
+        assert torch.equal(average, history[-1])
+    else:
+        assert (average >= span.amin(0)).all()
+        assert (average <= span.amax(0)).all()
+        assert not torch.equal(average, history[-1])
+
+
+@pytest.mark.parametrize("credit", ["whole_return", "reward_to_go"])
+@pytest.mark.parametrize("minibatches", [1, 2])
+def test_learning_is_reproducible_bit_for_bit(study, settings, credit, minibatches):
+    case = study(1, torch.float32)
+
+    def learned():
+        learner = case.learner(case.policy(), 10, 3, settings(credit=credit, minibatches=minibatches))
+        reinforce(learner, closeness_reward(case), 3)
+        return torch.cat([parameter.detach().flatten() for parameter in learner.policy.parameters()])
+
+    first = learned()
+    torch.manual_seed(17)  # the global generator plays no part
+    assert torch.equal(first, learned())
+
+
+@pytest.mark.parametrize("variant", ["improved", "printed"])
+def test_a_few_epochs_raise_the_return_on_an_easy_task(study, variant):
+    """Closeness with a wide basin, from a policy that holds the inputs near zero; the usual gain is 44."""
+    case = study(1, torch.float32)
+    params = case.params.learning.variants[variant].learner.model_copy(
+        update={"learning_rate_start": 1e-2, "learning_rate_end": 1e-2, "patience": 0}
+    )
+    learner = case.learner(case.policy(), 100, 25, params)
+    returns = [record.mean_return for record in reinforce(learner, closeness_reward(case, 1.0), 25)]
+    assert np.mean(returns[-3:]) > returns[0] + 20
+
+
+@pytest.mark.parametrize("minibatches", [1, 2])
+def test_an_entropy_bonus_keeps_exploration_up(study, settings, minibatches):
+    case = study(1, torch.float32)
+
+    def spread(bonus):
+        params = settings(credit="reward_to_go", entropy=bonus, minibatches=minibatches, learning_rate_start=3e-2)
+        return reinforce(case.learner(case.policy(), 20, 8, params), closeness_reward(case), 8)[-1].policy_std
+
+    assert spread(1.0) > spread(0.0) + 0.003
+
+
+@pytest.mark.torture
+def test_the_natural_gradient_raises_the_return_on_an_easy_task(study, settings):
+    """As the test of the variants above, in as many steps: the policy's distribution moves by the trust region in each."""
+    case = study(1, torch.float32)
+    changes = {"credit": "reward_to_go", "trust_region": 0.1, "learning_rate_start": 1.0, "learning_rate_end": 1.0}
+    learner = case.learner(case.policy(), 100, 25, settings(**changes))
+    returns = [record.mean_return for record in reinforce(learner, closeness_reward(case, 1.0), 25)]
+    assert np.mean(returns[-3:]) > returns[0] + 20
+
+
+def test_any_number_of_variables(synthetic, settings):
+    for n_controlled, n_manipulated in ((1, 1), (3, 3), (3, 2)):
+        case = synthetic(n_controlled, n_manipulated)
+        learner = case.learner(case.policy(), 6, 2, settings(credit="reward_to_go"))
+        assert len(reinforce(learner, closeness_reward(case), 2)) == 2
+
+
+# Early stopping
+
+
+def scripted(levels):
+    """A reward whose mean return follows `levels`, one an epoch, with a little spread for the advantage."""
+    levels = iter(levels)
+
+    def reward(batch):
+        spread = torch.linspace(-1, 1, batch.n_trajectories, dtype=batch.x.dtype)
+        return (next(levels) + 0.01 * spread).expand(batch.n_steps, -1)
+
+    return reward
+
+
+@pytest.mark.parametrize(
+    ("levels", "patience", "expected"),
+    [
+        ([5, 4, 3, 2, 1, 0], 0, 6),  # no early stop
+        ([5, 4, 3, 2, 1, 0], 3, 4),  # the best epoch and three worse ones
+        ([5, 4, 6, 4, 3, 2], 2, 5),  # an improvement starts the count again
+        ([1, 2, 3, 4, 5, 6], 1, 6),  # never stops while it improves
+        ([3, 1, 2, 2.5, 4, 5], 3, 4),  # better than the last is not better than the best
+    ],
+)
+def test_early_stopping_by_patience(study, settings, levels, patience, expected):
+    case = study()
+    learner = case.learner(case.policy(), 4, 6, settings())
+    records = reinforce(learner, scripted(levels), 6, patience)
+    assert len(records) == learner.epochs == expected
+
+
+# Training that cannot go on
+
+
+class Failing(LinearProcess):
+    """A process whose states are not numbers from the second epoch on."""
+
+    calls = 0
+
+    def step(self, x, u, noise):
+        self.calls += 1
+        return super().step(x, u, noise) * (float("nan") if self.calls > 50 else 1.0)
+
+
+def test_a_process_that_returns_nan_ends_training_with_the_epoch(study, settings):
+    case = study()
+    process = Failing(case.params.process, F64)
+    learner = Learner(case.policy(), process, case.features, settings(), 4, 5, stream(0))
+    with pytest.raises(TrainingError, match=r"epoch 2: .*not finite"):
+        reinforce(learner, closeness_reward(case), 5)
+    assert learner.epochs == 1
+    assert all(torch.isfinite(parameter).all() for parameter in learner.policy.parameters())
+
+
+def test_a_policy_that_has_turned_nan_ends_training_with_the_epoch(study, settings):
+    case = study()
+    learner = case.learner(case.policy(), 4, 5, settings())
+    learner.epoch(closeness_reward(case))
+    with torch.no_grad():
+        learner.policy.layers[1].bias_hh_l0[3] = float("nan")
+    with pytest.raises(TrainingError, match=r"epoch 2: .*not finite"):
+        learner.epoch(closeness_reward(case))
+
+
+@pytest.mark.parametrize("minibatches", [1, 3])
+def test_a_gradient_that_is_not_finite_ends_training_before_the_step(study, settings, minibatches):
+    case = study()
+    policy = case.policy()
+    before = policy.output.weight.detach().clone()
+    policy.output.bias.register_hook(lambda gradient: gradient * float("inf"))
+    with pytest.raises(TrainingError, match=r"epoch 1: the gradient of output\.bias is not finite"):
+        case.learner(policy, 6, 5, settings(minibatches=minibatches)).epoch(closeness_reward(case))
+    assert torch.equal(policy.output.weight, before)
+
+
+@pytest.mark.parametrize("rate", [1e3, 1e30])
+def test_an_absurd_learning_rate_gives_numbers_or_the_epoch(study, settings, rate):
+    """ReLU6 and the gates saturate, so most such rates give a useless policy, not NaN; none may end in another error."""
+    case = study(1, torch.float32)
+    learner = case.learner(case.policy(), 4, 3, settings(learning_rate_start=rate, learning_rate_end=rate))
+    try:
+        returns = [record.mean_return for record in reinforce(learner, closeness_reward(case), 3)]
+    except TrainingError:
+        return
+    assert np.isfinite(returns).all()
+
+
+@pytest.mark.parametrize("credit", ["whole_return", "reward_to_go"])
+def test_a_reward_without_spread_ends_training_with_the_cause(study, settings, credit):
+    """Nothing to learn from: the cause is the reward, not the learning rate."""
+    case = study()
+    learner = case.learner(case.policy(), 4, 5, settings(credit=credit))
+    with pytest.raises(TrainingError, match=r"epoch 1: .*(reward|return)"):
+        learner.epoch(lambda batch: torch.zeros(batch.n_steps, batch.n_trajectories, dtype=F64))

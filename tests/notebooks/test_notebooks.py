@@ -1,0 +1,257 @@
+"""The notebooks as they are committed, and proof that their regression tests can fail."""
+
+import ast
+import importlib.util
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import nbformat
+import pytest
+
+from helpers.runs.sources import PROJECT
+
+NOTEBOOKS = {path.stem: path for path in sorted((PROJECT / "notebooks").glob("*.ipynb"))}
+LONGEST = 80  # lines of code, without blank lines and comments
+MACHINE = re.compile(r"(?<![\w.])/(home|root|tmp|work|Users|private|var)/|[A-Z]:\\\\|site-packages|ipykernel_\d")
+
+_specification = importlib.util.spec_from_file_location("notebook_guard", PROJECT / "notebooks/conftest.py")
+guard = importlib.util.module_from_spec(_specification)
+environment_before = dict(os.environ)
+_specification.loader.exec_module(guard)
+os.environ.clear()  # the guard sets up the environment of the kernels; here it is only examined
+os.environ.update(environment_before)
+
+
+@pytest.fixture(params=NOTEBOOKS)
+def notebook(request):
+    return nbformat.read(NOTEBOOKS[request.param], as_version=4)
+
+
+def code_of(notebook):
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def test_the_nine_notebooks_are_there():
+    names = ["00_inferred_settings", "01_demonstrations", "02_offline_irl", "03_online_improvement"]
+    names += ["04_knowledge_transfer", "05_report", "06_limits_and_alternatives", "07_your_own_process", "08_claims"]
+    assert sorted(NOTEBOOKS) == names
+
+
+def test_a_notebook_tells_a_story_and_defines_nothing(notebook):
+    nbformat.validate(notebook)
+    first = notebook.cells[0]
+    assert first.cell_type == "markdown"
+    assert first.source.startswith("# ")
+    assert sum(cell.cell_type == "markdown" for cell in notebook.cells) >= 3
+    code = [cell.source for cell in code_of(notebook)]
+    lines = [line for source in code for line in source.splitlines() if line.strip() and not line.strip().startswith("#")]
+    assert len(lines) <= LONGEST
+    nodes = [node for source in code for node in ast.walk(ast.parse(source))]
+    assert not [node for node in nodes if isinstance(node, (ast.FunctionDef, ast.ClassDef, ast.AsyncFunctionDef))]
+
+
+def test_the_parameters_cell_comes_first_and_nothing_is_derived_in_it(notebook):
+    """papermill does not compute again what is derived from an injected value in that very cell."""
+    tagged = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", [])]
+    assert tagged == code_of(notebook)[:1]
+    assert all(isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant) for node in ast.parse(tagged[0].source).body)
+
+
+def test_a_notebook_holds_nothing_of_the_machine_or_the_moment(notebook):
+    assert set(notebook.metadata) == {"kernelspec", "language_info"}
+    for cell in notebook.cells:
+        assert set(cell.metadata) <= {"tags"}
+        for output in cell.get("outputs", []):
+            assert output.output_type in ("execute_result", "display_data"), "errors, warnings and printed text do not belong here"
+            text = json.dumps({kind: data for kind, data in output.data.items() if not kind.startswith("image/png")})
+            assert MACHINE.search(text) is None
+            assert "widget" not in text
+        assert MACHINE.search(cell.source) is None
+
+
+def test_a_notebook_was_executed_whole(notebook):
+    assert [cell.execution_count for cell in code_of(notebook)] == list(range(1, len(code_of(notebook)) + 1))
+
+
+# How outputs are compared --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("stored", "found", "same"),
+    [
+        ("gap 12.3456", "gap 12.3456", True),
+        ("gap 12.3456", "gap   12.3456\n", True),
+        ("gap 286.4421", "gap 286.4426", True),  # 2e-6 off
+        ("gap 286.4421", "gap 286.7285", False),  # 1e-3 off
+        ("gap -0.5", "gap 0.5", False),
+        ("1e-05", "0.00001", True),
+        ("1.5e-3", "1.5e-4", False),
+        ("0", "1e-12", True),
+        ("gap 1", "loss 1", False),
+        ("1 2 3", "1 2", False),
+        ("1 2", "2 1", False),
+        ("nan", "1.0", False),
+        ("inf", "inf", True),
+        ("C_A0", "C_A1", False),
+        ("", "1", False),
+    ],
+)
+def test_words_are_compared_exactly_and_numbers_within_the_tolerance(stored, found, same):
+    assert (guard.Output(stored) == guard.Output(found)) is same
+    assert (guard.Output(stored) != found) is not same
+
+
+@pytest.mark.parametrize(
+    ("stored", "found", "same"),
+    [
+        ("loss 12.3456  yes", "loss 9.1  no", True),
+        ("loss 12.3456", "gap 12.3456", False),
+        ("loss 1 2 3", "loss 1 2", False),
+        ("loss nan", "loss 1.5", True),
+    ],
+)
+def test_of_the_end_of_a_search_words_and_layout_are_compared(stored, found, same):
+    assert (guard.Layout(stored) == guard.Layout(found)) is same
+    assert (guard.Layout(stored) != found) is not same
+
+
+def test_only_the_notebook_of_searches_has_cells_of_which_the_numbers_are_not_compared(notebook):
+    tagged = [cell for cell in code_of(notebook) if guard.SEARCH in cell.metadata.get("tags", [])]
+    compared = [cell for cell in code_of(notebook) if cell.outputs and cell not in tagged]
+    assert len(compared) >= guard.FEWEST_COMPARED
+    if tagged:
+        assert notebook.cells[0].source.startswith("# 00 Inferred settings")
+        assert any("never worse than where it began" in cell.source for cell in code_of(notebook))
+
+
+# Proof that the tests can fail ---------------------------------------------------------------------------------------
+
+
+class Copy:
+    """A copy of a notebook, to change, with its guard beside it; results go beside it too."""
+
+    def __init__(self, name, folder):
+        shutil.copy(PROJECT / "notebooks/conftest.py", folder)
+        self.path = Path(folder) / f"{name}.ipynb"
+        self.content = json.loads(NOTEBOOKS[name].read_text(encoding="utf-8"))
+        self.code = [cell for cell in self.content["cells"] if cell["cell_type"] == "code"]
+        self.replace('output_root = ""', f"output_root = {str(folder)!r}")
+
+    def replace(self, old, new):
+        """Change a line of the parameters cell."""
+        source = "".join(self.code[0]["source"])
+        assert old in source
+        self.code[0]["source"] = source.replace(old, new)
+
+    def cell(self, words):
+        """The number and the content of the cell whose code holds these words."""
+        (found,) = [(number, cell) for number, cell in enumerate(self.code) if words in "".join(cell["source"])]
+        return found
+
+    def append(self, words, line):
+        """Put a line of code before the last one of a cell."""
+        number, cell = self.cell(words)
+        *before, last = "".join(cell["source"]).splitlines()
+        cell["source"] = "\n".join([*before, line, last])
+        return number
+
+    def scale_stored(self, words, factor):
+        """Multiply the last number with a fraction in the stored output of a cell, in text and HTML."""
+        number, cell = self.cell(words)
+        (output,) = cell["outputs"]
+        for kind in ("text/plain", "text/html"):
+            text = "".join(output["data"][kind])
+            last = list(re.finditer(r"-?\d+\.\d+", text))[-1]
+            changed = float(last.group()) * factor
+            assert changed != float(last.group())
+            output["data"][kind] = text[: last.start()] + f"{changed:.9g}" + text[last.end() :]
+        return number
+
+    def run(self):
+        """Exit status of nbval, the numbers of the cells that failed, and what it said."""
+        self.path.write_text(json.dumps(self.content), encoding="utf-8")
+        folder = self.path.parent
+        options = ["-p", "helpers.runs.quick_start", "-p", "no:cacheprovider", "--rootdir", folder]
+        options += ["--junitxml", folder / "result.xml", "--nbval", self.path]
+        done = subprocess.run([sys.executable, "-m", "pytest", *options], cwd=folder, capture_output=True, text=True, check=False)
+        cases = ET.parse(folder / "result.xml").getroot().iter("testcase")
+        outcome = {int(case.get("name").removeprefix("Cell ")): case.find("failure") is not None for case in cases}
+        assert list(outcome) in ([], list(range(len(self.code))))  # none if the guard refuses the notebook
+        return done.returncode, [number for number, failed in outcome.items() if failed], done.stdout + done.stderr
+
+
+def test_changed_numbers_fail_and_changed_style_and_last_digits_pass(tmp_path):
+    """All in one run, for each cell is judged alone."""
+    copy = Copy("02_offline_irl", tmp_path)
+    wrong = copy.scale_stored("stages.outcome(session", 1 + 1e-3)
+    copy.scale_stored("scores = stages.judge_imitation", 1 + 2e-6)
+    copy.append("curves = figures", "_ = [line.set(color='black', linewidth=4) for axis in curves.axes for line in axis.lines]")
+    copy.append("tracking = figures", "tracking.axes[0].lines[0].set_ydata(tracking.axes[0].lines[0].get_ydata() * 1.001)")
+    plotted, _ = copy.cell("drawn_summary(tracking)")
+    status, failed, said = copy.run()
+    assert status == 1, said
+    assert failed == [wrong, plotted], said
+
+
+@pytest.mark.torture
+def test_another_learning_rate_fails(tmp_path):
+    params = shutil.copytree(PROJECT / "params", tmp_path / "params")
+    text = (params / "learning.yaml").read_text(encoding="utf-8")
+    changed = text.replace("learning_rate_start: {value: 1.0e-2", "learning_rate_start: {value: 0.9e-2", 1)
+    assert changed != text
+    (params / "learning.yaml").write_text(changed, encoding="utf-8")
+    copy = Copy("02_offline_irl", tmp_path)
+    copy.replace('params_root = ""', f"params_root = {str(params)!r}")
+    learning, _ = copy.cell("stages.imitate")
+    status, failed, said = copy.run()
+    assert status == 1, said
+    assert failed[0] == learning, said
+    assert len(failed) >= 5
+
+
+@pytest.mark.torture
+def test_another_seed_fails(tmp_path):
+    copy = Copy("01_demonstrations", tmp_path)
+    copy.replace("seed = 0", "seed = 1")
+    expected = {copy.cell(words)[0] for words in ("table.describe()", "drawn_summary", "expert = pd.DataFrame")}
+    status, failed, said = copy.run()
+    assert status == 1, said
+    assert expected <= set(failed), said
+
+
+STRIPPED = [({"execution_count": None, "outputs": []}, "not every code cell was executed"), ({"outputs": []}, "fewer than")]
+
+
+@pytest.mark.parametrize(("strip", "says"), STRIPPED, ids=["stripped", "outputs only"])
+def test_a_notebook_without_outputs_is_refused(tmp_path, strip, says):
+    copy = Copy("05_report", tmp_path)
+    for cell in copy.code:
+        cell.update(strip)
+    copy.path.write_text(json.dumps(copy.content), encoding="utf-8")
+    with pytest.raises(pytest.UsageError, match=says):
+        guard.check_executed(copy.path)
+
+
+@pytest.mark.torture
+@pytest.mark.parametrize(("strip", "says"), STRIPPED, ids=["stripped", "outputs only"])
+def test_a_notebook_without_outputs_fails_instead_of_passing_unseen(tmp_path, strip, says):
+    copy = Copy("05_report", tmp_path)
+    for cell in copy.code:
+        cell.update(strip)
+    status, _, said = copy.run()
+    assert status not in (0, 5)
+    assert says in said
+
+
+def test_cells_run_in_another_order_fail(tmp_path):
+    copy = Copy("05_report", tmp_path)
+    copy.code[3]["execution_count"], copy.code[4]["execution_count"] = 5, 4
+    copy.path.write_text(json.dumps(copy.content), encoding="utf-8")
+    with pytest.raises(pytest.UsageError, match="in order"):
+        guard.check_executed(copy.path)

@@ -1,0 +1,100 @@
+"""Episodes and stretches out of a record: where they begin, what they hold, and why some do not count."""
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.own_plant.description import load_description
+from helpers.own_plant.episodes import episodes, stretches
+from helpers.own_plant.quality import examine
+from helpers.own_plant.records import read_records
+from helpers.own_plant.settings import load_own_plant
+from helpers.settings.leaf import InputError
+from tests.own_plant.plants import HOLD, HORIZON, MadeUpPlant
+
+CYCLES = 15
+
+
+@pytest.fixture
+def cut(tmp_path, root):
+    def found(plant, table=None, **changes):
+        path = plant.write(tmp_path, table, **changes)
+        description, params = load_description(path), load_own_plant(root).quality
+        clean = examine(read_records(tmp_path / description.data, description), description, params)
+        return clean, description, episodes(clean, description, params, torch.float64)
+
+    return found
+
+
+def test_episodes_begin_at_the_steps_to_the_task_s_set_point(cut):
+    plant = MadeUpPlant(2, 3, CYCLES)
+    _, description, found = cut(plant)
+    assert found.trajectories.y.shape == (HORIZON + 1, CYCLES, 2)
+    assert found.trajectories.u.shape == (HORIZON, CYCLES, 3)
+    assert found.starts == tuple(range(2 + HOLD, 2 + 2 * HOLD * CYCLES, 2 * HOLD))
+    rows = plant.table.iloc[3 * HOLD : 3 * HOLD + HORIZON + 1]
+    assert found.trajectories.y[:, 1].numpy() == pytest.approx(rows[["Y0.PV", "Y1.PV"]].to_numpy() - plant.steady_y)
+    assert found.trajectories.u[:, 1].numpy() == pytest.approx(rows[["U0.OP", "U1.OP", "U2.OP"]].to_numpy()[:-1] - plant.steady_u)
+    assert found.before[1].numpy() == pytest.approx(plant.table.loc[3 * HOLD - 1, ["U0.OP", "U1.OP", "U2.OP"]] - plant.steady_u)
+    assert not any(found.left_out.values())
+    task = description.task(torch.zeros(2), torch.zeros(2), torch.float64)
+    assert task.set_point.numpy() == pytest.approx(plant.set_point)
+    assert task.input_low.tolist() == [-3.0] * 3
+
+
+def test_episodes_that_a_gap_an_operator_or_a_new_set_point_spoils_do_not_count(cut):
+    plant = MadeUpPlant(2, 2, CYCLES)
+    table = plant.table.copy()
+    table.loc[HOLD + 4, "MODE"] = "MAN"
+    table.loc[3 * HOLD + 5 : 3 * HOLD + 30, "Y0.SP"] = plant.steady_y[0] - 2
+    table = table.drop(index=range(5 * HOLD + 3, 5 * HOLD + 11))
+    _, _, found = cut(plant, table)
+    assert found.left_out == {"cut short by a break": 1, "not in automatic": 1, "set point moved again": 1}
+    assert found.trajectories.n_trajectories == CYCLES - 3
+
+
+def test_a_loop_whose_set_point_stays_needs_a_scale_and_is_cut_into_windows(cut):
+    plant = MadeUpPlant(1, 1, CYCLES)
+    still = plant.content["controlled"][0] | {"set_point": float(plant.steady_y[0]), "error_scale": 0.5}
+    table = plant.table.assign(**{"Y0.SP": plant.steady_y[0]})
+    _, _, found = cut(plant, table, controlled=[still])
+    assert found.trajectories.n_trajectories == 2 * HOLD * CYCLES // (HORIZON + 1)
+    without = {key: value for key, value in still.items() if key != "error_scale"}
+    with pytest.raises(InputError, match="give 'error_scale'"):
+        cut(plant, table, controlled=[without])
+
+
+def test_too_few_episodes_are_refused_with_the_reasons(cut):
+    plant = MadeUpPlant(2, 2, CYCLES)
+    with pytest.raises(InputError, match=r"plant\.csv: 0 episodes of 12 samples .* expected 10 or more; left out: 15 cut short"):
+        cut(plant, plant.table[(plant.table.index % HOLD < 5) | (plant.table.index % HOLD > 14)])
+
+
+def test_a_record_shorter_than_an_episode_is_refused_with_the_reasons(cut):
+    plant = MadeUpPlant(2, 2, CYCLES)
+    with pytest.raises(InputError, match=r"plant\.csv: 0 episodes of 100 samples .* left out: 1 cut short"):
+        cut(plant, plant.table.iloc[: 2 * HOLD], horizon=100)
+
+
+def test_after_a_break_the_input_before_is_the_first_of_the_episode(cut):
+    plant = MadeUpPlant(1, 1, CYCLES)
+    still = plant.content["controlled"][0] | {"set_point": float(plant.steady_y[0]), "error_scale": 0.5}
+    table = plant.table.assign(**{"Y0.SP": plant.steady_y[0]})
+    table.loc[100:129, "U0.OP"] = np.nan
+    _, _, found = cut(plant, table, controlled=[still])
+    assert found.before.isfinite().all()
+    inputs = table["U0.OP"].to_numpy() - plant.steady_u
+    episode = found.starts.index(130 + 2)
+    assert found.before[episode].item() == pytest.approx(inputs[130])
+    assert found.before[episode + 1].item() == pytest.approx(inputs[130 + HORIZON])
+    assert found.before[0].item() == pytest.approx(inputs[0])
+
+
+def test_stretches_hold_every_usable_row_in_deviation_variables(cut):
+    plant = MadeUpPlant(2, 2, CYCLES)
+    clean, description, _ = cut(plant, plant.table.drop(index=range(100, 110)))
+    pieces = stretches(clean, description, 10)
+    assert [len(piece) for piece in pieces] == [100, len(plant.table) - 110]
+    assert pieces[1].y[0] == pytest.approx(plant.table.loc[110, ["Y0.PV", "Y1.PV"]].to_numpy(dtype=float) - plant.steady_y)
+    assert len(stretches(clean, description, 101)) == 1
+    assert np.isfinite(pieces[0].u).all()

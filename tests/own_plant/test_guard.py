@@ -1,0 +1,233 @@
+"""The guard: limits, bad measurements, the fall-back PID, and switches without a jump."""
+
+import numpy as np
+import pytest
+
+from helpers.own_plant.description import load_description
+from helpers.own_plant.guard import Guard, GuardLimits, Mode
+from helpers.settings.leaf import InputError
+from tests.own_plant.plants import MadeUpPlant
+
+LIMITS = GuardLimits(stale=6, hold=3, healthy=2, fade=2)
+
+
+class Asking:
+    """A policy that asks for one thing and remembers what it was shown."""
+
+    def __init__(self, asked):
+        self.asked, self.seen = np.array(asked, dtype=float), []
+
+    def reset(self):
+        self.seen.clear()
+
+    def step(self, y, set_point, u_previous):
+        self.seen.append((y[0].copy(), u_previous[0].copy()))
+        return self.asked[None]
+
+
+class Remembering:
+    """A policy whose memory takes in all that it is shown, as the hidden states of a network do."""
+
+    def reset(self):
+        self.memory = np.zeros(2)
+
+    def step(self, y, set_point, u_previous):
+        self.memory = 0.8 * self.memory + (set_point - y)[0] + 0.01 * u_previous[0]
+        return 20.0 + 0.1 * self.memory[None]
+
+
+@pytest.fixture
+def description(tmp_path):
+    return load_description(MadeUpPlant(2, 2, n_cycles=1).write(tmp_path))  # bounds 17..23 and 18..24, at rest 20 and 21
+
+
+class Measured:
+    """Measurements that never repeat themselves, unless told to."""
+
+    def __init__(self):
+        self.rng = np.random.default_rng(0)
+
+    def __call__(self, *changes):
+        y = np.array([50.0, 51.0]) + 0.01 * self.rng.normal(size=2)
+        for index, value in changes:
+            y[index] = value
+        return y
+
+
+SET_POINT = np.array([51.0, 52.0])
+
+
+def in_automatic(description, asked=(22.0, 23.0), limits=LIMITS, samples=30):
+    guard, measured = Guard(Asking(asked), description, limits), Measured()
+    for _ in range(samples):
+        guard.step(measured(), SET_POINT)
+    return guard, measured
+
+
+def test_the_switch_from_manual_does_not_jump_and_the_offset_fades(description):
+    guard, measured = Guard(Asking([22.0, 23.0]), description, LIMITS), Measured()
+    for _ in range(4):
+        guard.follow(measured(), SET_POINT, np.array([18.0, 19.0]))
+    assert guard.mode == Mode.MANUAL
+    assert len(guard.policy.seen) == 4  # its memory is warm
+    assert guard.policy.seen[-1][1].tolist() == [18.0, 19.0]
+    inputs = np.array([guard.step(measured(), SET_POINT) for _ in range(20)])
+    assert inputs[0].tolist() == [18.0, 19.0]
+    assert inputs[2] == pytest.approx(np.array([22.0, 23.0]) - 4 * np.exp(-1), abs=1e-9)
+    assert inputs[-1] == pytest.approx([22.0, 23.0], abs=1e-3)
+    assert guard.mode == Mode.POLICY
+
+
+def test_bounds_and_rates_hold_whatever_the_policy_asks(description):
+    slow = [variable.model_copy(update={"rate": 0.25}) for variable in description.manipulated]
+    description = description.model_copy(update={"manipulated": tuple(slow)})
+    guard, measured = Guard(Asking([100.0, -100.0]), description, LIMITS), Measured()
+    inputs = np.array([guard.step(measured(), SET_POINT) for _ in range(60)])
+    assert np.abs(np.diff(inputs, axis=0)).max() <= 0.25 + 1e-12
+    assert inputs[-1].tolist() == [23.0, 18.0]
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 120.0, -1.0], ids=str)
+def test_a_bad_measurement_is_held_then_the_pid_takes_the_loops_that_are_left(description, bad):
+    guard, measured = in_automatic(description)
+    before = guard.u.copy()
+    for _ in range(LIMITS.hold):
+        assert guard.step(measured((0, bad)), SET_POINT).tolist() == before.tolist()
+        assert guard.mode == Mode.HOLD
+    taken_over = guard.step(measured((0, bad)), SET_POINT)
+    assert guard.mode == Mode.PID
+    assert taken_over == pytest.approx(before)  # bumpless
+    for _ in range(10):
+        inputs = guard.step(measured((0, bad)), SET_POINT)
+    assert inputs[0] == before[0]  # its loop is blind
+    assert inputs[1] > before[1] + 0.05  # the error is about one, and the integral gain 0.2 per second
+
+
+def test_the_policy_comes_back_after_enough_good_measurements_without_a_jump(description):
+    guard, measured = in_automatic(description)
+    for _ in range(8):
+        guard.step(measured((1, np.nan)), SET_POINT)
+    u = guard.u.copy()
+    guard.step(measured(), SET_POINT)
+    assert guard.mode == Mode.PID
+    returned = guard.step(measured(), SET_POINT)
+    assert guard.mode == Mode.POLICY
+    assert np.abs(returned - u).max() < 0.5
+    assert in_automatic(description)[0].mode == Mode.POLICY
+
+
+def test_a_short_fault_never_reaches_the_pid(description):
+    guard, measured = in_automatic(description)
+    guard.step(measured((0, np.nan)), SET_POINT)
+    modes = [(guard.step(measured(), SET_POINT), guard.mode)[1] for _ in range(3)]
+    assert modes == [Mode.HOLD, Mode.POLICY, Mode.POLICY]
+
+
+def test_a_sensor_that_does_not_move_is_stale(description):
+    guard, measured = in_automatic(description)
+    modes = [(guard.step(measured((0, 50.5)), SET_POINT), guard.mode)[1] for _ in range(LIMITS.stale + LIMITS.hold + 1)]
+    assert modes[: LIMITS.stale] == [Mode.POLICY] * LIMITS.stale
+    assert modes[LIMITS.stale :] == [Mode.HOLD] * LIMITS.hold + [Mode.PID]
+
+
+def test_a_policy_that_fails_is_replaced_too(description):
+    guard, measured = in_automatic(description)
+    guard.policy.asked[0] = np.nan
+    modes = [(guard.step(measured(), SET_POINT), guard.mode)[1] for _ in range(LIMITS.hold + 1)]
+    assert modes == [Mode.HOLD] * LIMITS.hold + [Mode.PID]
+    assert np.isfinite(guard.u).all()
+
+
+def test_without_a_pid_the_inputs_stay_held(description):
+    guard, measured = in_automatic(description.model_copy(update={"pid": ()}))
+    before = guard.u.copy()
+    for _ in range(20):
+        inputs = guard.step(measured((0, np.nan)), SET_POINT)
+    assert inputs == pytest.approx(before)
+
+
+def test_two_loops_on_one_input_are_refused(description):
+    twice = tuple(loop.model_copy(update={"manipulated": "u0"}) for loop in description.pid)
+    with pytest.raises(InputError, match="two loops set the same manipulated variable"):
+        Guard(Asking([20.0, 21.0]), description.model_copy(update={"pid": twice}), LIMITS)
+
+
+def test_a_set_point_that_is_no_number_is_bad_and_the_last_one_counts_on(description):
+    guard, measured = Guard(Remembering(), description, LIMITS), Measured()
+    for _ in range(30):
+        guard.step(measured(), SET_POINT)
+    memory, inputs, modes = guard.policy.memory.copy(), [], []
+    for _ in range(LIMITS.hold + 3):
+        inputs.append(guard.step(measured(), np.array([np.nan, 52.0])))
+        modes.append(guard.mode)
+    assert modes == [Mode.HOLD] * LIMITS.hold + [Mode.PID] * 3
+    assert guard.policy.memory.tolist() == memory.tolist()
+    assert inputs[-1][0] > inputs[0][0]  # its loop goes on towards the last set point, which lies above
+    inputs += [guard.step(measured(), SET_POINT) for _ in range(20)]
+    assert guard.mode == Mode.POLICY
+    assert np.isfinite(guard.policy.memory).all()
+    assert np.isfinite(inputs).all()
+    assert ((guard.low <= inputs) & (inputs <= guard.high)).all()
+
+
+def test_without_any_set_point_the_inputs_stay_held(description):
+    guard, measured = Guard(Remembering(), description, LIMITS), Measured()
+    inputs = [guard.step(measured(), np.full(2, np.nan)) for _ in range(LIMITS.hold + 5)]
+    assert guard.mode == Mode.PID
+    assert np.array(inputs) == pytest.approx(np.tile([20.0, 21.0], (len(inputs), 1)))
+
+
+@pytest.mark.parametrize("manual", [True, False], ids=["manual", "automatic"])
+def test_the_policy_s_memory_stands_still_on_a_number_out_of_range(description, manual):
+    guard, measured = Guard(Remembering(), description, LIMITS), Measured()
+    memories = []
+    for y in (measured(), measured((0, -9999.0))):
+        if manual:
+            guard.follow(y, SET_POINT, np.array([20.0, 21.0]))
+        else:
+            guard.step(y, SET_POINT)
+        memories.append(guard.policy.memory.tolist())
+    assert memories[1] == memories[0] != [0.0, 0.0]
+
+
+def test_an_operator_s_input_that_is_no_number_is_not_followed(description):
+    guard, measured = Guard(Remembering(), description, LIMITS), Measured()
+    guard.follow(measured(), SET_POINT, np.array([18.0, 19.0]))
+    guard.follow(measured(), SET_POINT, np.array([np.nan, 19.5]))
+    assert guard.u.tolist() == [18.0, 19.5]
+    assert guard.step(measured(), SET_POINT).tolist() == [18.0, 19.5]
+    assert np.isfinite(guard.policy.memory).all()
+
+
+def test_a_pid_that_fails_leaves_the_inputs_where_they_are(description):
+    broken = tuple(loop.model_copy(update={"proportional": np.nan}) for loop in description.pid)
+    guard, measured = in_automatic(description.model_copy(update={"pid": broken}))
+    before = guard.u.copy()
+    for _ in range(LIMITS.hold + 5):
+        guard.step(measured((0, np.nan)), SET_POINT)
+    assert guard.mode == Mode.PID
+    assert guard.u == pytest.approx(before)
+
+
+def test_a_sensor_that_comes_and_goes_reaches_the_pid(description):
+    guard, measured = in_automatic(description)
+    before, modes = guard.u.copy(), []
+    for sample in range(4 * LIMITS.hold):
+        guard.step(measured((0, np.nan)) if sample % 2 == 0 else measured(), SET_POINT)
+        modes.append(guard.mode)
+    assert modes == [Mode.HOLD] * 2 * LIMITS.hold + [Mode.PID] * 2 * LIMITS.hold
+    assert guard.u[1] > before[1] + 0.05  # the other loop works
+    for _ in range(LIMITS.healthy):
+        guard.step(measured(), SET_POINT)
+    assert guard.mode == Mode.POLICY
+    guard.step(measured((0, np.nan)), SET_POINT)
+    assert guard.mode == Mode.HOLD  # and the count begins anew
+
+
+def test_after_a_phase_in_manual_the_count_begins_anew(description):
+    guard, measured = in_automatic(description)
+    for _ in range(LIMITS.hold):
+        guard.step(measured((0, np.nan)), SET_POINT)
+    guard.follow(measured(), SET_POINT, guard.u)
+    guard.step(measured((0, np.nan)), SET_POINT)
+    assert guard.mode == Mode.HOLD

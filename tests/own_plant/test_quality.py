@@ -1,0 +1,175 @@
+"""Reading a historian file: every defect is found with its rows, repaired as stated and counted, or refused in one sentence."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from helpers.own_plant.description import load_description
+from helpers.own_plant.quality import CONVERSIONS, examine
+from helpers.own_plant.records import PlantDataError, read_records
+from helpers.own_plant.settings import load_own_plant
+from tests.own_plant.plants import MadeUpPlant
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return MadeUpPlant(2, 2, n_cycles=15)
+
+
+@pytest.fixture
+def clean(plant, tmp_path, root):
+    def examined(table, **changes):
+        path = plant.write(tmp_path, table, **changes)
+        description = load_description(path)
+        return examine(read_records(path.parent / description.data, description), description, load_own_plant(root).quality)
+
+    return examined
+
+
+def found(clean, check, column=None):
+    rows = [entry for entry in clean.findings if entry.check == check and column in (None, entry.column)]
+    assert len(rows) == 1, [entry.check for entry in clean.findings]
+    return rows[0]
+
+
+def refusal(action, *arguments, **changes):
+    with pytest.raises(PlantDataError) as caught:
+        action(*arguments, **changes)
+    sentence = str(caught.value)
+    assert "\n" not in sentence
+    assert "plant." in sentence
+    return sentence
+
+
+def test_a_sound_file_is_left_as_it_is(clean, plant):
+    after = clean(plant.table)
+    assert {entry.check for entry in after.findings} <= {"set point step", "input at a bound"}
+    assert after.table["Y0.PV"].to_numpy() == pytest.approx(plant.table["Y0.PV"].to_numpy())
+    assert after.table["segment"].eq(0).all()
+    assert found(after, "set point step", "Y1.SP").rows[:2] == (22, 42)  # sample 20 stands in the file's row 22
+
+
+def test_parquet_and_stamps_read_like_csv_and_numbers(clean, plant):
+    dated = plant.table.assign(TIME=pd.Timestamp("2026-03-01") + pd.to_timedelta(plant.table["TIME"], unit="s"))
+    expected = clean(plant.table).table
+    for table, name in ((dated, "plant.csv"), (plant.table, "plant.parquet"), (dated, "plant.parquet")):
+        pd.testing.assert_frame_equal(clean(table, data=name).table, expected)
+
+
+@pytest.mark.parametrize("zone", ["Z", "+01:00"])
+def test_stamps_with_a_zone_read_like_those_without(clean, plant, zone):
+    stamps = pd.Timestamp("2026-01-05") + pd.to_timedelta(plant.table["TIME"], unit="s")
+    zoned = plant.table.assign(TIME=stamps.dt.strftime("%Y-%m-%dT%H:%M:%S") + zone)
+    pd.testing.assert_frame_equal(clean(zoned).table, clean(plant.table).table)
+
+
+def test_where_the_clocks_change_no_time_is_lost(clean, plant):
+    stamps = pd.Timestamp("2026-10-25", tz="UTC") + pd.to_timedelta(plant.table["TIME"] + 3500, unit="s")
+    local = plant.table.assign(TIME=stamps.dt.tz_convert("Europe/Berlin"))
+    for name in ("plant.csv", "plant.parquet"):
+        pd.testing.assert_frame_equal(clean(local, data=name).table, clean(plant.table).table)
+
+
+def test_words_in_the_place_of_numbers_are_filled_on_a_line(clean, plant):
+    table = plant.table.astype(object)
+    table.loc[[50, 51], "Y0.PV"] = "I/O Timeout"
+    after = clean(table)
+    assert found(after, "no number").rows == (52, 53)
+    left, right = plant.table["Y0.PV"][[49, 52]]
+    assert after.table["Y0.PV"][[50, 51]].tolist() == pytest.approx([left + (right - left) / 3, left + 2 * (right - left) / 3])
+    assert found(after, "filled", "Y0.PV").count == 2
+
+
+def test_a_short_gap_is_filled_and_a_long_one_ends_a_stretch(clean, plant):
+    after = clean(plant.table.drop(index=[30, 31, *range(100, 140)]))
+    assert found(after, "short gap").count == 1
+    assert found(after, "long gap").rows == (2 + 140 - 42,)
+    assert len(after.table) == len(plant.table) - 40
+    assert after.table["U0.OP"][[30, 31]].tolist() == [plant.table["U0.OP"][29]] * 2  # an input is held
+    assert after.table["row"][[29, 30, 31, 32]].tolist() == [31, 0, 0, 32]
+    assert after.table["segment"].value_counts().to_dict() == {0: 100, 1: len(plant.table) - 140}
+
+
+def test_doubled_late_and_unsorted_rows_find_their_place(clean, plant):
+    corrected = plant.table["Y0.PV"][59] + 0.02
+    table = pd.concat([plant.table.iloc[:60], plant.table.iloc[59:60].assign(**{"Y0.PV": corrected}), plant.table.iloc[60:]])
+    table = table.reset_index(drop=True)
+    table.loc[100, "TIME"] += 0.5
+    table.iloc[[200, 201]] = table.iloc[[201, 200]].to_numpy()
+    after = clean(table)
+    assert found(after, "doubled row").rows == (61,)
+    assert after.table["Y0.PV"][59] == pytest.approx(corrected)
+    assert found(after, "uneven time").count == 2
+    assert found(after, "out of order").rows == (203,)
+    assert after.table["U0.OP"].to_numpy() == pytest.approx(plant.table["U0.OP"].to_numpy())
+
+
+def test_a_frozen_sensor_and_a_spike_are_found(clean, plant):
+    table = plant.table.copy()
+    table.loc[200:230, "Y1.PV"] = table.loc[200, "Y1.PV"]
+    table.loc[310, "Y0.PV"] += 20
+    after = clean(table)
+    assert found(after, "frozen sensor").count == 30
+    assert found(after, "frozen sensor").rule == "10 or more equal values: all but the first missing"
+    assert found(after, "outlier", "Y0.PV").rows == (312,)
+    assert after.table["Y0.PV"][310] == pytest.approx(plant.table["Y0.PV"][[309, 311]].mean())
+    assert after.table["segment"][[200, 201, 230, 231]].tolist() == [0, -1, -1, 1]
+    assert found(after, "of no use").count == 30
+
+
+def test_inputs_at_bounds_and_manual_rows_are_counted_and_kept(clean, plant):
+    table = plant.table.copy()
+    table.loc[10:14, "U0.OP"] = plant.steady_u[0] + 3
+    table.loc[40:49, "MODE"] = "MAN"
+    after = clean(table)
+    assert found(after, "input at a bound", "U0.OP").count >= 5
+    assert found(after, "not in automatic").rows == (42, 43, 44, 45, 46)
+    assert after.table["segment"].eq(0).all()
+    assert not after.table["automatic"][40:50].any()
+
+
+def test_a_new_episode_ends_a_stretch(clean, plant):
+    after = clean(plant.table.assign(RUN=np.where(plant.table.index < 77, "a", "b")), episode="RUN")
+    assert after.table["segment"].diff().fillna(0).ne(0).to_numpy().nonzero()[0].tolist() == [77]
+
+
+def test_a_row_out_of_order_does_not_cut_its_episode_into_pieces(clean, plant):
+    table = plant.table.assign(RUN=np.where(plant.table.index < 77, "a", "b"))
+    table.iloc[[75, 80]] = table.iloc[[80, 75]].to_numpy()
+    after = clean(table, episode="RUN")
+    assert after.table["segment"].diff().fillna(0).ne(0).to_numpy().nonzero()[0].tolist() == [77]
+
+
+def test_another_unit_is_named(clean, plant):
+    for words, table in {
+        "a share for per cent": plant.table.assign(**{"U0.OP": plant.table["U0.OP"] / 100}),
+        "degrees Fahrenheit for degrees Celsius": plant.table.assign(**{"Y1.PV": plant.table["Y1.PV"] * 1.8 + 32}),
+    }.items():
+        sentence = refusal(clean, table)
+        assert words in sentence
+        assert "rows 2, 3" in sentence
+        assert words in CONVERSIONS
+
+
+def test_what_no_rule_can_help_is_refused(clean, plant, tmp_path):
+    assert "'Y0.PV'; the columns are" in refusal(clean, plant.table.drop(columns="Y0.PV"))
+    assert "holds no number" in refusal(clean, plant.table.assign(**{"Y0.PV": "off"}))
+    assert "too little excitation" in refusal(clean, plant.table.assign(**{"U0.OP": 20.0}))
+    moved = plant.table.assign(**{"U1.OP": plant.table["U0.OP"] - plant.steady_u[0] + plant.steady_u[1]})
+    assert "move as one" in refusal(clean, moved)
+    assert "'sampling_time' is 1 s" in refusal(clean, plant.table, sampling_time=1.0)
+    late = 0.9 * np.random.default_rng(0).integers(0, 2, len(plant.table))
+    assert "between two samples" in refusal(clean, plant.table.assign(TIME=plant.table["TIME"] + late))
+    assert "no time in rows 2, 3" in refusal(clean, plant.table.assign(TIME="yesterday"))
+    assert "holds no rows" in refusal(clean, plant.table.iloc[:0])
+    path = plant.write(tmp_path)
+    description = load_description(path)
+    assert "is missing" in refusal(read_records, tmp_path / "plant.txt", description)
+    (tmp_path / "plant.csv").write_text("TIME,Y0.PV\n1,2,3\n", encoding="utf-8")
+    assert "not readable as CSV" in refusal(read_records, tmp_path / "plant.csv", description)
+
+
+def test_the_section_names_every_finding(clean, plant):
+    section = clean(plant.table.drop(index=30)).section()
+    assert list(section.columns) == ["check", "column", "count", "rows", "rule"]
+    assert section.set_index("check").loc["short gap", "rows"] == "32"

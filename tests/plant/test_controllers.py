@@ -1,0 +1,147 @@
+"""The PID law by hand, and that no episode inherits another's memory."""
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.plant.controllers import PID, MinimumVariance, Operator, SaturatedLQ
+from helpers.plant.rollout import stream
+
+DT = 0.5
+
+
+@pytest.fixture
+def pid(study):
+    gains = study().params.demonstrator.model_copy(
+        update={"proportional": (2.0, 10.0), "integral": (3.0, 0.0), "derivative": (0.25, 1.0)}
+    )
+    return PID(gains, torch.tensor([1.0, -1.0], dtype=torch.float64), DT)
+
+
+def run(pid, observations):
+    """Commands (T, K, n_u) for observations (T, K, n_y), from a fresh memory."""
+    memory, commands = pid.start(observations.shape[1], len(observations), stream(0)), []
+    for observation in observations:
+        command, memory = pid.act(observation, memory)
+        commands.append(command)
+    return torch.stack(commands)
+
+
+def test_hand_computed_sequence(pid):
+    # First loop: e = 1, 0.5, -0.5; sum(e) dt = 0.5, 0.75, 0.5; change / dt = none, -1, -2.
+    # Second loop: e = -1, -1, 1; no integral action; change / dt = none, 0, 4.
+    y = torch.tensor([[[0.0, 0.0]], [[0.5, 0.0]], [[1.5, -2.0]]], dtype=torch.float64)
+    expected = [[[2 + 1.5, -10.0]], [[1 + 2.25 - 0.25, -10.0]], [[-1 + 1.5 - 0.5, 10 + 4.0]]]
+    np.testing.assert_allclose(run(pid, y), expected, rtol=1e-14)
+
+
+def test_the_first_sample_has_integral_action_but_no_derivative(pid):
+    y = torch.tensor([[[-9.0, 9.0]]], dtype=torch.float64)
+    np.testing.assert_allclose(run(pid, y)[0, 0], [2 * 10 + 3 * 10 * DT, 10 * -10.0], rtol=1e-14)
+
+
+def test_the_integral_goes_on_beyond_any_bound(pid):
+    y = torch.full((1000, 1, 2), -99.0, dtype=torch.float64)
+    np.testing.assert_allclose(run(pid, y)[-1, 0, 0], 2 * 100 + 3 * 100 * 1000 * DT, rtol=1e-12)
+
+
+def test_episodes_do_not_share_memory(pid):
+    y = torch.randn(20, 3, 2, generator=stream(0, "y"), dtype=torch.float64)
+    first = run(pid, y)
+    assert torch.equal(first, run(pid, y))  # a fresh start after another episode
+    interleaved, other = pid.start(3, 20, stream(0)), pid.start(3, 20, stream(0))
+    for observation, command in zip(y, first, strict=True):
+        _, other = pid.act(-5 * observation, other)
+        found, interleaved = pid.act(observation, interleaved)
+        assert torch.equal(found, command)
+
+
+def test_trajectories_of_a_batch_do_not_see_each_other(pid):
+    y = torch.randn(20, 4, 2, generator=stream(0, "y"), dtype=torch.float64)
+    together = run(pid, y)
+    for row in range(4):
+        assert torch.equal(together[:, row : row + 1], run(pid, y[:, row : row + 1]))
+
+
+def test_the_memory_of_a_step_is_not_overwritten(pid):
+    memory = pid.start(1, 2, stream(0))
+    _, second = pid.act(torch.ones(1, 2, dtype=torch.float64), memory)
+    assert memory.previous is None
+    assert torch.equal(memory.integral, torch.zeros(1, 2, dtype=torch.float64))
+    kept = second.integral.clone()
+    pid.act(torch.zeros(1, 2, dtype=torch.float64), second)
+    assert torch.equal(second.integral, kept)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_number_type_follows_the_set_point(study, dtype):
+    case = study(1, dtype)
+    command, _ = case.pid.act(torch.zeros(3, 2, dtype=dtype), case.pid.start(3, 1, stream(0)))
+    assert command.dtype == dtype
+    assert command.shape == (3, 2)
+
+
+def test_minimum_variance_expects_the_next_state_at_the_set_point(study):
+    case = study(2)
+    controller = MinimumVariance(case.process.state_step, case.process.input_step, case.task.set_point)
+    x = torch.tensor([[0.0, 0.0], [0.9, 4.2], [3.0, -7.0]], dtype=torch.float64)
+    command, _ = controller.act(x, controller.start(3, 1, stream(0)))
+    reached = case.process.step(x, command, torch.zeros_like(x))
+    torch.testing.assert_close(reached, case.task.set_point.expand_as(x), rtol=1e-10, atol=1e-10)
+
+
+# Other demonstrators -------------------------------------------------------------------------------------------------
+
+
+def test_predictive_law_against_the_plan_written_out(study):
+    """The whole plan of N moves as one least-squares problem, its first move taken."""
+    case, horizon, penalty = study(2), 4, 0.3
+    process, task = case.process, case.task
+    A, B = process.state_step.numpy(), process.input_step.numpy()
+    span = (task.input_high - task.input_low).numpy()
+    observation, last = np.array([0.9, 3.9]), np.array([11.0, 40.0])
+    # x_i = A^i x_0 + sum_j A^(i-1-j) B (last + the sum of the moves up to j)
+    rows, targets = [], []
+    for i in range(1, horizon + 1):
+        effect = np.zeros((2, 2 * horizon))
+        free = np.linalg.matrix_power(A, i) @ observation
+        for j in range(i):
+            step = np.linalg.matrix_power(A, i - 1 - j) @ B
+            free = free + step @ last
+            for k in range(j + 1):
+                effect[:, 2 * k : 2 * k + 2] += step
+        rows.append(effect / task.error_scale.numpy()[:, None])
+        targets.append((task.set_point.numpy() - free) / task.error_scale.numpy())
+    rows.append(np.sqrt(penalty) * np.diag(np.tile(1 / span, horizon)))
+    targets.append(np.zeros(2 * horizon))
+    plan = np.linalg.lstsq(np.concatenate(rows), np.concatenate(targets), rcond=None)[0]
+    controller = SaturatedLQ(process.state_step, process.input_step, task, horizon, penalty)
+    command, memory = controller.act(torch.tensor(observation[None]), torch.tensor(last[None]))
+    np.testing.assert_allclose(command[0], last + plan[:2], rtol=1e-9)
+    assert torch.equal(memory, command.clamp(task.input_low, task.input_high))
+
+
+def test_predictive_law_rests_at_the_set_point(study):
+    case = study(2)
+    controller = SaturatedLQ(case.process.state_step, case.process.input_step, case.task, 10, 0.1)
+    at_rest = controller.input_at_rest[None]
+    x = case.task.set_point[None]
+    torch.testing.assert_close(case.process.step(x, at_rest, torch.zeros_like(x)), x)
+    torch.testing.assert_close(controller.act(x, at_rest)[0], at_rest)
+    start = controller.start(3, 5, stream(0))
+    assert torch.equal(start, torch.zeros(3, 2, dtype=x.dtype))
+    far = controller.act(torch.zeros(3, 2, dtype=x.dtype) - 99, start)
+    assert (far[0] > case.task.input_high).any()  # asked for beyond the bounds, remembered within
+    assert (far[1] <= case.task.input_high).all()
+
+
+def test_operator_takes_over_beyond_the_threshold_only(study):
+    case = study(1)  # set points -1 and 4
+    held = torch.tensor([torch.nan, -30.0], dtype=torch.float64)
+    operator = Operator(case.pid, case.task, 0.25, held)
+    y = torch.tensor([[[0.0, 0.0]], [[-2.0, 4.9]], [[-2.0, 5.1]], [[-1.0, 5.2]], [[-1.0, 4.9]]], dtype=torch.float64)
+    alone, commands = run(case.pid, y), run(operator, y)
+    assert operator.by_hand(y)[:, 0].tolist() == [[False, False]] * 2 + [[False, True]] * 2 + [[False, False]]
+    expected = alone.clone()
+    expected[2:4, 0, 1] = -30.0
+    assert torch.equal(commands, expected)  # the PID goes on computing: after hand control it is where it would have been

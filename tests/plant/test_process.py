@@ -1,0 +1,159 @@
+"""The process against its stochastic differential equation, closed forms and the balances behind it."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+from helpers.plant.process import LinearProcess, linearised_balances
+from helpers.plant.rollout import stream
+
+A = np.array([[-3.997, -0.446], [-6.092, -1.581]])  # Eq. 4.1.3b
+B = np.diag([0.500, 0.305])
+D = np.array([0.500, 0.300])  # Eq. 4.1.3c, the diagonal
+X0, U0 = np.array([0.7, -1.3]), np.array([5.0, -20.0])
+F64 = torch.float64
+
+
+def repeat(row, n):
+    return torch.tensor(row, dtype=F64).repeat(n, 1)
+
+
+def end_without_noise(study, dt, horizon=2.0):
+    """The state at `horizon` of the noise-free process, integrated with steps of `dt`."""
+    process = study(process={"sampling_time": dt}).process
+    x, u = repeat(X0, 1), repeat(U0, 1)
+    for _ in range(round(horizon / dt)):
+        x = process.step(x, u, torch.zeros_like(x))
+    return x[0].numpy()
+
+
+@pytest.mark.equation("4.1.3")
+def test_mean_and_covariance_of_one_step(study):
+    process, n = study().process, 200_000
+    after = process.step(repeat(X0, n), repeat(U0, n), torch.randn(n, 2, generator=stream(0, "step"), dtype=F64)).numpy()
+    mean, variance = X0 + (A @ X0 + B @ U0) * 0.04, (D * X0) ** 2 * 0.04
+    error = after - mean
+    np.testing.assert_array_less(np.abs(error.mean(0)), 5 * np.sqrt(variance / n))
+    np.testing.assert_array_less(np.abs((error**2).mean(0) / variance - 1), 5 * np.sqrt(2 / n))
+    assert abs(np.corrcoef(error.T)[0, 1]) < 5 / np.sqrt(n)  # the Wiener processes of the loops are independent
+
+
+@pytest.mark.equation("4.1.3")
+def test_second_moments_along_a_path(study):
+    """Without input E[x x'] obeys M <- S M S' + dt diag(d^2 M_ii), S = I + A dt, exactly."""
+    process, n, dt = study().process, 100_000, 0.04
+    generator = stream(0, "moments")
+    x, u = repeat(X0, n), torch.zeros(n, 2, dtype=F64)
+    moment, step = np.outer(X0, X0), np.eye(2) + A * dt
+    for _ in range(10):
+        x = process.step(x, u, torch.randn(n, 2, generator=generator, dtype=F64))
+        moment = step @ moment @ step.T + dt * np.diag(D**2 * np.diag(moment))
+    products = np.einsum("ki,kj->kij", x.numpy(), x.numpy())
+    np.testing.assert_array_less(np.abs(products.mean(0) - moment), 5 * products.std(0) / np.sqrt(n))
+
+
+@pytest.mark.equation("4.1.3")
+def test_without_noise_the_step_converges_to_first_order(study):
+    exact = solve_ivp(lambda _, x: A @ x + B @ U0, (0, 2), X0, rtol=1e-10, atol=1e-12).y[:, -1]
+    closed = expm(2 * A) @ X0 + np.linalg.solve(A, (expm(2 * A) - np.eye(2)) @ B @ U0)
+    np.testing.assert_allclose(exact, closed, rtol=1e-8)
+    errors = [np.linalg.norm(end_without_noise(study, 0.04 / 2**halving) - exact) for halving in range(8)]
+    ratios = np.array(errors[:-1]) / errors[1:]
+    np.testing.assert_allclose(ratios[-3:], 2, rtol=0.02)
+    assert errors[-1] < 1e-2 * np.linalg.norm(exact)
+
+
+@pytest.mark.equation("4.1.3")
+def test_the_disturbance_grows_with_the_root_of_the_time_step(study):
+    x, u = repeat(X0, 5), repeat(U0, 5)
+    noise = torch.randn(5, 2, generator=stream(0, "scaling"), dtype=F64)
+    kick = [
+        process.step(x, u, noise) - process.step(x, u, torch.zeros_like(noise))
+        for process in (study(process={"sampling_time": dt}).process for dt in (0.01, 0.09))
+    ]
+    torch.testing.assert_close(kick[1], 3 * kick[0], rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.equation("4.1.3c")
+def test_the_disturbance_vanishes_at_the_steady_state_and_is_proportional_elsewhere(study):
+    process, noise = study().process, torch.full((1, 2), 3.0, dtype=F64)
+    rest = torch.zeros(1, 2, dtype=F64)
+    assert torch.equal(process.step(rest, rest, noise), rest)
+    np.testing.assert_allclose(process.disturbance(repeat(X0, 1))[0], np.diag(D) @ X0, rtol=1e-14)
+
+
+@pytest.mark.equation("4.1.3b")
+def test_drift_is_linear_in_state_and_input(study):
+    process = study().process
+    np.testing.assert_allclose(process.drift(repeat(X0, 1), repeat(U0, 1))[0], A @ X0 + B @ U0, rtol=1e-12)
+    x, u = repeat(X0, 3), repeat(U0, 3)
+    still = process.step(x, u, torch.zeros_like(x))
+    torch.testing.assert_close(still, x + process.drift(x, u) * 0.04, rtol=1e-13, atol=0)
+
+
+def test_a_step_leaves_its_arguments_alone(study):
+    process = study().process
+    x, u, noise = repeat(X0, 3), repeat(U0, 3), torch.ones(3, 2, dtype=F64)
+    process.step(x, u, noise)
+    assert torch.equal(x, repeat(X0, 3))
+    assert torch.equal(u, repeat(U0, 3))
+    assert torch.equal(noise, torch.ones(3, 2, dtype=F64))
+
+
+@pytest.mark.equation("4.1.4")
+def test_observation_is_read_with_a_relative_error(study):
+    process, n = study().process, 200_000
+    x = repeat(X0, n)
+    ratio = (process.observe(x, torch.randn(n, 2, generator=stream(0, "observe"), dtype=F64)) / x).numpy()
+    np.testing.assert_array_less(np.abs(ratio.mean(0) - 1), 5 * 0.025 / np.sqrt(n))
+    np.testing.assert_allclose(ratio.std(0), 0.025, rtol=5 / np.sqrt(2 * n))
+    assert abs(np.corrcoef(ratio.T)[0, 1]) < 5 / np.sqrt(n)
+    rest = torch.zeros(1, 2, dtype=F64)
+    assert torch.equal(process.observe(rest, torch.ones_like(rest)), rest)
+
+
+@pytest.mark.equation("4.1.3b")
+def test_the_balances_give_the_printed_matrices(study):
+    balance = study().params.process.balance
+    state, inputs = linearised_balances(balance)
+    # The groups have three decimals; a22 = -1.582 comes out where the paper prints -1.581, so its last digit is allowed to differ.
+    np.testing.assert_allclose(state, A, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(np.array(state)[[0, 0, 1], [0, 1, 0]].round(3), A[[0, 0, 1], [0, 1, 0]], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(inputs, B, rtol=0, atol=1e-12)
+
+
+@pytest.mark.equation("4.1.3b")
+@pytest.mark.parametrize(
+    ("concentration", "temperature", "jacket"), [(1.0, 350.0, 420.0), (0.2, 500.0, 480.0), (5.0, 298.0, 390.0)]
+)
+def test_linearised_balances_are_the_jacobian_of_the_arrhenius_balances(study, concentration, temperature, jacket):
+    """At any steady state with these groups: central differences of the nonlinear balances, in absolute variables."""
+    groups = study().params.process.balance
+    q, k, exchange, heat = groups.dilution_rate, groups.rate_constant, groups.heat_exchange, groups.reaction_heat
+    activation = groups.rate_sensitivity * temperature**2 / (k * concentration)  # E/R
+    prefactor = k * np.exp(activation / temperature)
+    feed = concentration * (1 + k / q)
+    inlet = temperature + (heat * k * concentration - exchange * (jacket - temperature)) / q
+
+    def balances(z):
+        c, t, c0, t_e = z
+        rate = prefactor * np.exp(-activation / t) * c
+        return np.array([q * (c0 - c) - rate, q * (inlet - t) - heat * rate + exchange * (t_e - t)])
+
+    steady = np.array([concentration, temperature, feed, jacket])
+    np.testing.assert_allclose(balances(steady), 0, atol=1e-9)
+    steps = 1e-5 * steady
+    jacobian = np.column_stack([(balances(steady + row) - balances(steady - row)) / (2 * row.sum()) for row in np.diag(steps)])
+    state, inputs = linearised_balances(groups)
+    np.testing.assert_allclose(jacobian, np.hstack([state, inputs]), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_sizes_and_number_type_follow_the_parameters(study, dtype):
+    process = LinearProcess(study().params.process, dtype)
+    assert (process.n_states, process.n_outputs, process.n_inputs) == (2, 2, 2)
+    x = torch.ones(4, 2, dtype=dtype)
+    assert process.step(x, x, x).dtype == dtype
+    assert process.observe(x, x).dtype == dtype

@@ -1,0 +1,341 @@
+"""Mutated parameter files, artifacts and tables: a correct load or one sentence that names the file, never anything else.
+
+CASES in the environment says how many (60 by default; `make torture` asks for 5,000).
+"""
+
+import copy
+import hashlib
+import io
+import json
+import math
+import os
+import pickle
+import re
+import shutil
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from helpers.own_plant.settings import load_own_plant
+from helpers.own_plant.tank import load_tank
+from helpers.plant.rollout import rollout, stream
+from helpers.report.claims import load_claims
+from helpers.runs import identity
+from helpers.runs.artifacts import load_stage, save_stage, trajectories_from_table, trajectories_to_table
+from helpers.runs.identity import inputs
+from helpers.runs.sources import PROJECT
+from helpers.settings.evidence import load_experiments, load_identification
+from helpers.settings.leaf import InputError, read_yaml
+from helpers.settings.limits import load_limits
+from helpers.settings.paper import load, load_published
+
+CASES = int(os.environ.get("CASES", "60"))
+SLOWEST = 20.0  # seconds of the processor: what takes longer hangs
+PARAMS = PROJECT / "params"
+FILES = sorted(path.name for path in PARAMS.glob("*.yaml"))
+NOTEBOOKS = {
+    "02_offline_irl": 1,
+    "04_knowledge_transfer": 3,
+    "05_report": None,
+    "06_limits_and_alternatives": 1,
+    "07_your_own_process": 1,
+    "08_claims": 2,
+}  # and the case with which each is run
+NAMES = (("C_A", "T"), ("C_A0", "T_E"))
+
+
+def some(share, **options):
+    """Settings for a share of all cases."""
+    health = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much]
+    return settings(
+        max_examples=math.ceil(share * CASES),
+        deadline=None,
+        database=None,
+        derandomize=True,
+        suppress_health_check=health,
+        **options,
+    )
+
+
+def outcome(action, *names):
+    """Run a loader: it returns, or raises an InputError of one line that holds one of the names; and it ends soon."""
+    began = time.process_time()
+    try:
+        return action()
+    except InputError as error:
+        sentence = str(error)
+        assert "\n" not in sentence
+        assert len(sentence) < 2000
+        assert any(name in sentence for name in names), sentence
+        return None
+    finally:
+        assert time.process_time() - began < SLOWEST
+
+
+# Parameter files -----------------------------------------------------------------------------------------------------
+
+ODD_NUMBERS = [0, -1, 1, 2, 10**400, -0.0, 1e308, 1e-308, math.nan, math.inf, -math.inf, 2**63]
+SCALARS = st.one_of(
+    st.none(), st.booleans(), st.sampled_from(ODD_NUMBERS), st.integers(-9, 9), st.floats(width=32), st.text(max_size=8), st.dates()
+)
+ANYTHING = st.recursive(
+    SCALARS,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5) | st.integers(0, 3), inner, max_size=3),
+    max_leaves=6,
+)
+BOMB = "\n".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9) if n else 'x'}]" for n in range(30))
+LINES = [
+    "!!python/object/apply:os.system ['touch exploded']",
+    "extra: !!python/object/new:os.system ['touch exploded']",
+    "extra: !!python/name:os.system",
+    "extra: !unknown x",
+    "extra: &a [*a]",
+    "extra: {<<: *nowhere}",
+    f"extra: {'[' * 3000}",
+    "extra: 1\nextra: 2",
+    "? [a, b]\n: c",
+    "--- second document",
+    "\t- tab",
+    "extra: \x07",
+    "extra: 0x1F",
+    BOMB,
+]
+
+
+def nodes(content, path=()):
+    """The path of every entry of nested dictionaries and lists."""
+    entries = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    for key, entry in entries:
+        yield (*path, key)
+        yield from nodes(entry, (*path, key))
+
+
+@st.composite
+def parameter_files(draw):
+    """A file's name and its mutated bytes."""
+    name = draw(st.sampled_from(FILES))
+    text = (PARAMS / name).read_text(encoding="utf-8")
+    kind = draw(st.sampled_from(["value", "value", "value", "delete", "rename", "swap", "cut", "noise", "line"]))
+    if kind in ("value", "delete", "rename", "swap"):
+        content = read_yaml(PARAMS / name)
+        places = sorted(nodes(content), key=str)
+        *path, last = draw(st.sampled_from(places))
+        parent = content
+        for key in path:
+            parent = parent[key]
+        if kind == "value":
+            parent[last] = draw(ANYTHING)
+        elif kind == "swap":
+            *other, other_last = draw(st.sampled_from(places))
+            value = content
+            for key in (*other, other_last):
+                value = value[key]
+            parent[last] = copy.deepcopy(value)
+        else:
+            value = parent.pop(last)
+            if kind == "rename" and isinstance(parent, dict):
+                parent[draw(st.text(max_size=6))] = value
+        return name, yaml.safe_dump(content, allow_unicode=True, sort_keys=False).encode()
+    raw = text.encode()
+    place = draw(st.integers(0, len(raw)))
+    if kind == "cut":
+        return name, raw[:place]
+    if kind == "noise":
+        return name, raw[:place] + draw(st.binary(max_size=6)) + raw[place + draw(st.integers(0, 6)) :]
+    lines = text.splitlines()
+    lines.insert(draw(st.integers(0, len(lines))), draw(st.sampled_from(LINES)))
+    return name, "\n".join(lines).encode()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder of parameter files, one of which each case replaces."""
+    return tmp_path_factory.mktemp("params")
+
+
+def load_everything(root):
+    """Every loader of parameter files, as the notebooks use them."""
+    params = {case: load(root, case) for case in (1, 2, 3)}
+    load_published(root)
+    load_experiments(root, params[1])
+    load_identification(root, params[1])
+    load_claims(root)
+    load_limits(root, params[1])
+    load_own_plant(root)
+    load_tank(root, params[1].process)
+    for notebook, case in NOTEBOOKS.items():
+        inputs(notebook, root, "smoke", case)
+    return params
+
+
+@pytest.fixture
+def same_versions(monkeypatch):
+    """What is installed does not depend on the files, and to ask for it again and again takes longer than all loaders."""
+    found = identity.versions()
+    monkeypatch.setattr(identity, "versions", lambda: found)
+
+
+@pytest.mark.usefixtures("same_versions")
+@some(0.4)
+@given(mutated=parameter_files())
+def test_mutated_parameter_files(folder, monkeypatch, mutated):
+    monkeypatch.chdir(folder)
+    for path in PARAMS.glob("*.yaml"):
+        (folder / path.name).write_bytes(path.read_bytes())
+    name, raw = mutated
+    (folder / name).write_bytes(raw)
+    outcome(lambda: load_everything(folder), *(f"{folder / file}: " for file in FILES))
+    assert not (folder / "exploded").exists()
+
+
+def test_the_committed_files_pass(root):
+    assert set(load_everything(root)) == {1, 2, 3}
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.usefixtures("same_versions")
+def test_every_file_is_among_those_that_are_loaded(root, tmp_path, name):
+    shutil.copytree(root, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / name
+    path.write_text(
+        "extra: {value: 1, unit: '-', source: made up, status: assumed}\n" + path.read_text(encoding="utf-8"), encoding="utf-8"
+    )
+    with pytest.raises(InputError, match=re.escape(f"{path}: ")):
+        load_everything(tmp_path)
+
+
+# Artifacts -----------------------------------------------------------------------------------------------------------
+
+
+class Explosion:
+    """What a pickled file may hold: code that runs when it is loaded."""
+
+    def __reduce__(self):
+        return Path.touch, (Path("exploded"),)
+
+
+def pickled_by_torch():
+    buffer = io.BytesIO()
+    torch.save({"a": Explosion()}, buffer)
+    return buffer.getvalue()
+
+
+FORGED = [b"", b"{}", b"null", pickle.dumps(Explosion()), pickled_by_torch(), b"\x93NUMPY\x01\x00", bytes(range(256))]
+STAGE_FILES = ["record.json", "table.csv", "policy.safetensors"]
+RECORDS = st.dictionaries(st.sampled_from(["files", "seed", "inputs", "upstream"]), ANYTHING, max_size=4)
+
+
+@st.composite
+def changes_of_files(draw):
+    """The name of one of a stage's files, and a function that changes its bytes."""
+    name = draw(st.sampled_from(STAGE_FILES))
+    kind = draw(st.sampled_from(["cut", "noise", "noise", "forged", "json"]))
+    place, noise, length = draw(st.floats(0, 1)), draw(st.binary(max_size=9)), draw(st.integers(0, 9))
+    forged = draw(st.sampled_from(FORGED))
+    if kind == "json":
+        forged = json.dumps(draw(RECORDS | ANYTHING), default=str).encode()
+
+    def change(raw):
+        at = round(place * len(raw))
+        return {"cut": raw[:at], "noise": raw[:at] + noise + raw[at + length :]}.get(kind, forged)
+
+    return name, change, draw(st.booleans())
+
+
+@pytest.fixture(scope="module")
+def stage_of(tmp_path_factory, root):
+    """A stage with a table and a policy, and a function that reads all of it."""
+    from conftest import assemble  # noqa: PLC0415
+
+    case = assemble(load(root, 1), torch.float32)
+    folder = tmp_path_factory.mktemp("results") / "stage"
+    table = pd.DataFrame({"stage": ["a", "b"], "metric": ["c", "d"], "value": [0.1, math.nan]})
+    save_stage(folder, {"seed": 1}, {"table.csv": table}, case.policy())
+
+    def read():
+        stage = load_stage(folder, "notebook 02")
+        stage.table("table.csv", ("stage", "metric", "value"))
+        return stage.policy(case.params.learning, case.task)
+
+    return folder, {name: (folder / name).read_bytes() for name in STAGE_FILES}, read
+
+
+@some(0.35)
+@given(mutation=changes_of_files())
+def test_mutated_artifacts(stage_of, monkeypatch, mutation):
+    folder, good, read = stage_of
+    monkeypatch.chdir(folder.parent)
+    name, change, sealed = mutation
+    for file, raw in good.items():
+        (folder / file).write_bytes(raw)
+    (folder / name).write_bytes(change(good[name]))
+    if sealed and name != "record.json":  # a record that was forged along with it does not help
+        record = json.loads(good["record.json"])
+        record["files"][name] = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+        (folder / "record.json").write_text(json.dumps(record))
+    policy = outcome(read, *(f"{folder / file}: " for file in STAGE_FILES), f"{folder}")
+    if policy is not None:
+        assert all(tensor.isfinite().all() for tensor in policy.state_dict().values())
+    assert not (folder.parent / "exploded").exists()
+
+
+# Tables of demonstrations --------------------------------------------------------------------------------------------
+
+CELLS = st.one_of(
+    st.floats(), st.integers(), st.text(max_size=5), st.none(), st.booleans(), st.sampled_from(["1e999", "0x1", "1_000"])
+)
+
+
+@pytest.fixture(scope="module")
+def recorded(root):
+    """A table of demonstrations."""
+    from conftest import assemble  # noqa: PLC0415
+
+    case = assemble(load(root, 1), torch.float64)
+    return trajectories_to_table(rollout(case.process, case.pid, case.task, 3, stream(0, "properties")), *NAMES, 0.04)
+
+
+@st.composite
+def changes_of_tables(draw):
+    """A function that changes a table of demonstrations, or the text of its file."""
+    kind = draw(st.sampled_from(["cell", "cell", "column", "drop", "rows", "twice", "text", "order"]))
+    row, column = draw(st.integers(0, 10**6)), draw(st.integers(0, 10**6))
+    value, seed, noise = draw(CELLS), draw(st.integers(0, 99)), draw(st.text(max_size=9))
+
+    def change(table):
+        name, place = table.columns[column % len(table.columns)], row % len(table)
+        if kind == "cell":
+            changed = table.astype(object)
+            changed.iloc[place, column % len(table.columns)] = value
+        elif kind == "column":
+            changed = table.assign(**{name: [value] * len(table)})
+        elif kind == "drop":
+            changed = table.drop(columns=name)
+        elif kind == "rows":
+            changed = table.drop(index=table.index[place:])
+        elif kind == "twice":
+            changed = pd.concat([table, table.iloc[[place]]])
+        else:
+            changed = table.sample(frac=1, random_state=seed)
+        text = changed.to_csv(index=False)
+        at = row % len(text)
+        return text[:at] + noise + text[at + seed :] if kind == "text" else text
+
+    return change
+
+
+@some(0.25)
+@given(change=changes_of_tables(), dtype=st.sampled_from([torch.float32, torch.float64]))
+def test_mutated_tables_of_demonstrations(tmp_path, recorded, change, dtype):
+    stage = save_stage(tmp_path / "stage", {}, texts={"demonstrations.csv": change(recorded)})
+    path = stage.path("demonstrations.csv")
+    found = outcome(lambda: trajectories_from_table(stage.table("demonstrations.csv"), *NAMES, dtype, path), f"{path}: ")
+    if found is not None:
+        assert all(signal.isfinite().all() for signal in vars(found).values())
+        assert {signal.dtype for signal in vars(found).values()} == {dtype}

@@ -1,0 +1,169 @@
+"""Claims: the file, the rule of the verdict, and the numbers it is given."""
+
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+from ruamel.yaml import YAML
+
+from helpers.report.claims import COLUMNS, Claim, collect, judge, load_claims, verdicts
+from helpers.runs.artifacts import ArtifactError, save_stage
+from helpers.runs.request import PROJECT
+from helpers.settings.leaf import ParameterError
+
+BASE = {"section": "1", "statement": "so it is", "cases": (1,), "margin": 0.0, "why": "because"}
+ONE, TWO = {"a number": {"value": "s/r/m"}}, {"two": {"value": "s/r/m", "against": "s/r/n"}}
+
+
+def claim(test="difference_below", **changes):
+    quantities = ONE if test.startswith("value") else TWO
+    return Claim(**{**BASE, "test": test, "quantities": quantities, **changes})
+
+
+def paired(value, against=0.0):
+    return pd.DataFrame({"value": np.asarray(value, float), "against": np.broadcast_to(np.asarray(against, float), len(value))})
+
+
+# The file
+
+
+def test_the_committed_claims(root):
+    claims = load_claims(root)
+    assert len(claims) >= 40
+    compared = {name for name, entry in claims.items() if entry.test == "not_comparable"}
+    assert "minutes_online" in compared
+    assert all(set(entry.cases) <= {1, 2, 3} for entry in claims.values())
+
+
+def test_every_number_of_the_ordinary_stages_is_one_that_they_write(root):
+    """Those of notebook 08 are checked with its verbs, in test_experiments."""
+    claims = load_claims(root)
+    found = collect(claims, PROJECT / "notebooks/inputs", "smoke", [0])
+    known = set(zip(found["case"], found["quantity"], strict=True))
+    for name, entry in claims.items():
+        for quantity in entry.quantities.values():
+            for reference in (quantity.value, quantity.against):
+                if reference and not reference.startswith("experiments/"):
+                    assert {(case, reference) for case in entry.cases} <= known, name
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"margin": None}, "key 'hot_start': the test 'difference_below' needs 'margin' and 'quantities'"),
+        ({"test": "larger"}, "key 'hot_start.test'"),
+        ({"test": "value_below"}, "key 'hot_start': the test 'value_below' needs no 'against'"),
+        ({"test": "not_comparable"}, "key 'hot_start': a claim that is not comparable has neither"),
+        ({"cases": []}, "key 'hot_start.cases'"),
+        ({"margins": 1}, "key 'hot_start.margins': the key is unknown"),
+        ({"section": 3.3}, "key 'hot_start.section'"),
+        ({"quantities": {"x": {"value": "no reference"}}}, "key 'hot_start.quantities.x.value'"),
+        ({"quantities": {"x": {"value": "a/b/c"}}}, "key 'hot_start': the test 'difference_below' needs an 'against' in 'x'"),
+    ],
+)
+def test_a_mistake_is_one_sentence_that_names_file_and_key(root, tmp_path, changes, sentence):
+    yaml = YAML(typ="safe", pure=True)
+    content = yaml.load(root / "claims.yaml")
+    content["hot_start"] |= changes
+    yaml.dump(content, tmp_path / "claims.yaml")
+    with pytest.raises(ParameterError) as caught:
+        load_claims(tmp_path)
+    assert str(caught.value).startswith(f"{tmp_path / 'claims.yaml'}: {sentence}")
+    assert "\n" not in str(caught.value)
+
+
+# The rule
+
+
+@pytest.mark.parametrize(
+    ("values", "verdict"),
+    [
+        ([-1, -2, -3, -4, -5], "holds"),
+        ([1, 2, 3, 4, 5], "does not hold"),
+        ([-3, -2, 1, 2, 3], "cannot tell"),
+        ([0, 0, 0, 0, 0], "does not hold"),  # no better is not better
+        ([-1, -2, -3, -4], "cannot tell"),  # four seeds
+        ([-1, -2, -3, -4, np.nan], "cannot tell"),
+        ([-1, -2, -3, -4, -5, np.nan], "holds"),
+        ([], "cannot tell"),
+    ],
+)
+@pytest.mark.parametrize("shift", [0.0, 3.5])
+def test_verdicts_of_a_difference_below(values, verdict, shift):
+    found = judge(claim(), paired(np.add(values, shift), shift))
+    assert found.verdict == verdict
+    # Mirrored, the same numbers say the same of a difference above, except where nothing differs.
+    mirrored = judge(claim("difference_above"), paired(np.subtract(shift, values), shift))
+    assert mirrored.verdict == verdict
+    assert mirrored.median == pytest.approx(-found.median, nan_ok=True)
+    assert (found.reason == "a tie") == (values == [0, 0, 0, 0, 0])
+
+
+def test_margin_ratio_and_value():
+    values = [2.0, 2.2, 2.4, 2.6, 2.8, 3.0]
+    assert judge(claim("ratio_above", margin=0.9), paired(values, 2.0)).verdict == "holds"
+    assert judge(claim("ratio_below", margin=0.9), paired(values, 2.0)).verdict == "does not hold"
+    assert judge(claim("ratio_below", margin=1.25), paired(values, 2.0)).verdict == "cannot tell"
+    assert judge(claim("value_above", margin=1.9), paired(values)).verdict == "holds"
+    assert judge(claim("value_below", margin=1.9), paired(values)).verdict == "does not hold"
+
+
+def test_seeds_are_compared_in_pairs():
+    """The seeds differ much more among each other than the two from each other; pairing shows the difference all the same."""
+    level = np.array([1.0, 50.0, 200.0, 900.0, 3000.0, 9000.0])
+    found = judge(claim(), paired(level - 0.1, level))
+    assert found.verdict == "holds"
+    assert found.median == pytest.approx(-0.1)
+    assert found.ci_low <= found.median <= found.ci_high < 0
+
+
+def test_not_comparable_gives_its_reason():
+    found = judge(claim("not_comparable", margin=None, quantities={}), paired([]))
+    assert (found.verdict, found.reason, found.n) == ("not comparable", "because", 0)
+
+
+# The numbers
+
+
+@pytest.fixture
+def results(tmp_path):
+    """Six seeds of a stage with two numbers, written in different orders; the fourth lacks one of them."""
+    for seed in range(6):
+        rows = [("r", "m", 1.0 * seed), ("r", "n", 1.0 * seed + 1), ("r", "unasked", 0.0)][:: 1 if seed % 2 else -1]
+        rows = [row for row in rows if seed != 4 or row[1] != "n"]
+        frame = pd.DataFrame(rows, columns=["stage", "metric", "value"])
+        save_stage(tmp_path / f"paper/seed_{seed}/case_1/s", {}, {"scores.csv": frame})
+    return tmp_path
+
+
+def test_from_files_to_verdicts(results):
+    claims = {
+        "less": claim(),
+        "elsewhere": claim(cases=(2,)),
+        "never": claim(quantities={"x": {"value": "t/r/m", "against": "t/r/n"}}),
+        "silent": claim("not_comparable", margin=None, quantities={}),
+    }
+    values = collect(claims, results, "paper", range(6))
+    assert set(values["quantity"]) == {"s/r/m", "s/r/n"}
+    assert len(values) == 11
+    table = verdicts(claims, values)
+    assert tuple(table.columns) == COLUMNS
+    assert table["verdict"].tolist() == ["holds", "cannot tell", "cannot tell", "not comparable"]
+    assert table["reason"].tolist() == ["the whole interval lies below 0", "not run", "not run", "because"]
+    first = table.iloc[0]
+    assert (first["n"], first["median"], first["test"], first["quantity"]) == (5, -1.0, "difference below 0", "two")
+
+
+def test_nothing_run_at_all(tmp_path):
+    claims = {"less": claim()}
+    table = verdicts(claims, collect(claims, tmp_path, "paper", [0]))
+    assert table[["n", "verdict", "reason"]].to_numpy().tolist() == [[0, "cannot tell", "not run"]]
+
+
+def test_a_changed_result_is_refused(results):
+    (results / "paper/seed_1/case_1/s/scores.csv").write_text("stage,metric,value\nr,m,0\n", encoding="utf-8")
+    with pytest.raises(ArtifactError, match="has changed since it was written"):
+        collect({"less": claim()}, results, "paper", range(6))
+    shutil.rmtree(results / "paper/seed_1")
+    assert collect({"less": claim()}, results, "paper", range(6))["seed"].nunique() == 5

@@ -1,0 +1,412 @@
+"""Figures: what is drawn is what was handed in; colours, labels and units; style does not change the data."""
+
+from collections.abc import Sequence
+from itertools import combinations
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.transforms import Bbox
+
+from helpers.plant.task import Trajectories
+from helpers.report import drawings, figures
+from helpers.runs import stages
+from helpers.settings.leaf import DEVIATION
+
+OUTPUTS = ("C_A", "T", "level_tank")
+INPUTS = ("C_A0", "T_E", "F_in")
+SET_POINTS = (-1.0, 4.0, 0.5)
+WORDS = {"C_A": "concentration of reagent", "T": "reactor temperature", "T_E": "jacket temperature"}
+N_STEPS = 40
+
+
+def trajectories(n_loops: int, seed: int) -> Trajectories:
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.randn(N_STEPS + 1, 7, n_loops, generator=generator)
+    u = torch.randn(N_STEPS, 7, n_loops, generator=generator)
+    return Trajectories(x, x + 1, u, 2 * u)
+
+
+def response(n_loops: int = 2) -> pd.DataFrame:
+    return stages.response_table(trajectories(n_loops, 0), trajectories(n_loops, 1), OUTPUTS[:n_loops], INPUTS[:n_loops])
+
+
+def draw(n_loops: int = 2, table: pd.DataFrame | None = None) -> Figure:
+    table = response(n_loops) if table is None else table
+    return figures.control_figure(table, OUTPUTS[:n_loops], INPUTS[:n_loops], SET_POINTS[:n_loops], WORDS)
+
+
+def history(n_epochs: int = 60) -> pd.DataFrame:
+    epochs = np.arange(1, n_epochs + 1)
+    frame = pd.DataFrame({"iteration": epochs, "epochs": epochs, "mean_return": np.sqrt(epochs), "feature_gap": 1 / epochs})
+    for index, feature in enumerate(("C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III")):
+        frame[f"alpha:{feature}"] = np.cos(index + epochs / 50)
+    return frame
+
+
+def rows_of(table: pd.DataFrame, controller: str, variable: str) -> pd.DataFrame:
+    return table.query("controller == @controller and variable == @variable")
+
+
+def texts(figure: Figure) -> str:
+    """All text of a figure, line breaks as spaces."""
+    figure.draw_without_rendering()
+    return " ".join(text.get_text() for text in figure.findobj(matplotlib.text.Text)).replace("\n", " ")
+
+
+def curve(line: Line2D) -> np.ndarray:
+    """The points of a line, shape (n, 2)."""
+    return np.asarray(line.get_xydata(), dtype=float)
+
+
+def legend_lines(figure: Figure) -> dict[str, Line2D]:
+    legend = figure.legends[0]
+    handles = zip(legend.get_texts(), legend.legend_handles, strict=True)
+    return {text.get_text(): handle for text, handle in handles if isinstance(handle, Line2D)}
+
+
+def test_response_table_holds_mean_and_deviation_of_true_states_and_applied_inputs() -> None:
+    x = torch.tensor([[[1.0], [3.0]], [[2.0], [2.0]]])
+    u = torch.tensor([[[5.0], [7.0]]])
+    batch = Trajectories(x, x + 100, u, u + 100)
+    table = stages.response_table(batch, batch, ("T",), ("T_E",))
+    assert list(table.columns) == ["controller", "variable", "kind", "time_index", "mean", "std"]
+    for controller in ("agent", "expert"):
+        states, inputs = rows_of(table, controller, "T"), rows_of(table, controller, "T_E")
+        assert states["kind"].unique() == ["controlled"]
+        assert inputs["kind"].unique() == ["manipulated"]
+        assert states["time_index"].tolist() == [0, 1]
+        assert inputs["time_index"].tolist() == [0]
+        assert states["mean"].tolist() == [2.0, 2.0]
+        assert inputs["mean"].tolist() == [6.0]
+        assert states["std"].tolist() == pytest.approx([2**0.5, 0.0])
+        assert inputs["std"].tolist() == pytest.approx([2**0.5])
+
+
+def test_response_table_keeps_agent_and_expert_apart() -> None:
+    table = response()
+    agent, expert = trajectories(2, 0), trajectories(2, 1)
+    np.testing.assert_allclose(rows_of(table, "agent", "T")["mean"], agent.x[..., 1].double().mean(1), rtol=1e-9)
+    np.testing.assert_allclose(rows_of(table, "expert", "C_A0")["std"], expert.u[..., 0].double().std(1), rtol=1e-9)
+
+
+@pytest.mark.parametrize("n_loops", [1, 2, 3])
+def test_control_figure_draws_every_response_as_given(n_loops: int) -> None:
+    table = response(n_loops)
+    axes = draw(n_loops, table).axes
+    assert len(axes) == 3 * n_loops  # response, control and zoom of each loop
+    for loop in range(n_loops):
+        for panel, variable, start in zip(
+            axes[3 * loop : 3 * loop + 3], (OUTPUTS[loop], INPUTS[loop], OUTPUTS[loop]), (0, 0, 5), strict=True
+        ):
+            lines = {str(line.get_label()): line for line in panel.lines}
+            bands = {str(band.get_label()): band for band in panel.collections if isinstance(band, PolyCollection)}
+            for controller in ("agent", "expert"):
+                expected = rows_of(table, controller, variable).query("time_index >= @start")
+                label = f"{expected['kind'].iloc[0]}, {controller}"
+                points = curve(lines[label])
+                np.testing.assert_array_equal(points[: len(expected)], expected[["time_index", "mean"]])
+                outline = np.asarray(bands[f"{label}: {figures.BAND}"].get_paths()[0].vertices)
+                for edge in (expected["mean"] - expected["std"], expected["mean"] + expected["std"]):
+                    assert np.isin(edge, outline[:, 1]).all()
+                if variable in INPUTS:  # the last input acts until sample T, where it is drawn once more
+                    assert points[-1].tolist() == [N_STEPS, points[-2, 1]]
+                    assert len(points) == N_STEPS + 1
+                    assert lines[label].get_drawstyle() == "steps-post"
+                else:
+                    assert curve(lines["set point"]).tolist() == [[start, SET_POINTS[loop]], [N_STEPS, SET_POINTS[loop]]]
+
+
+def test_control_figure_has_the_colours_of_the_paper_and_styles_that_differ() -> None:
+    drawn = draw()
+    shown = legend_lines(drawn)
+    hues = {label.split(r" $\pi")[0]: to_hex(line.get_color()) for label, line in shown.items()}
+
+    def channels(label: str) -> tuple[int, int, int]:
+        return tuple(int(hues[label][start : start + 2], 16) for start in (1, 3, 5))  # type: ignore[return-value]
+
+    red, green, blue = channels("controlled variable, agent")
+    assert red > 2 * max(green, blue)
+    red, green, blue = channels("manipulated variable, agent")
+    assert blue > 2 * max(red, green)
+    dark, light = channels("controlled variable, PID"), channels("manipulated variable, PID")
+    assert dark[1] > 1.5 * max(dark[0], dark[2])
+    assert light[1] > 1.5 * max(light[0], light[2])
+    assert light[1] > 1.5 * dark[1]
+    red, green, blue = channels("set point")
+    assert red > green > blue
+    styles = {label: line.get_linestyle() for label, line in shown.items()}
+    agents = {style for label, style in styles.items() if "agent" in label}
+    experts = {style for label, style in styles.items() if "PID" in label}
+    assert agents == {"-"}
+    assert experts == {"--"}
+    for axes in drawn.axes:  # the legend speaks of the lines that are drawn
+        for line in axes.lines:
+            assert to_hex(line.get_color()) in hues.values()
+
+
+@pytest.mark.parametrize("n_loops", [2, 3])
+def test_control_figure_names_panels_variables_units_and_all_that_is_drawn(n_loops: int) -> None:
+    figure = draw(n_loops)
+    shown = texts(figure)
+    for letter in "ABCDEF"[: 2 * n_loops]:
+        assert rf"\mathbf{{{letter}}}" in shown
+    for axes in figure.axes:
+        assert DEVIATION in axes.get_ylabel().replace("\n", " ")
+    assert shown.count("control interaction (sample)") == 2 * n_loops
+    for part in (
+        "Jacket temperature $T_E^*$",
+        "$C_{A0}^*$",
+        "agent",
+        "PID",
+        "set point",
+        "standard deviation",
+        "manipulated variable",
+    ):
+        assert part in shown
+
+
+KINDS = [pytest.param(kind, marks=pytest.mark.torture) for kind in ("tracking", "online", "budget", "mdp", "framework", "network")]
+
+
+@pytest.mark.parametrize("kind", ["control", "curves", "seeds", *KINDS])
+def test_nothing_is_cut_off_and_no_panels_overlap(kind: str) -> None:
+    figure = {
+        "control": lambda: draw(3),
+        "tracking": lambda: figures.tracking_figure(response(), OUTPUTS[:2], SET_POINTS[:2], WORDS),
+        "curves": lambda: figures.learning_curves(history(), {40: "policy kept"}, {"PID": 3.0}, {"paper": 0.1}),
+        "online": lambda: figures.learning_curves(history()[["epochs", "mean_return"]], {10: "second round"}, {"PID": 3.0}),
+        "seeds": lambda: draw(2, several(response(), ["mean"])),
+        "budget": budget_figure,
+        "mdp": drawings.mdp_figure,
+        "framework": drawings.framework_figure,
+        "network": lambda: drawings.network_figure((20, 20), 2, 2, 0.01),
+    }[kind]()
+    figure.draw_without_rendering()
+    drawn, (width, height) = figure.get_tightbbox(), figure.get_size_inches()
+    assert drawn.x0 >= -0.01
+    assert drawn.y0 >= -0.01
+    assert drawn.x1 <= width + 0.01
+    assert drawn.y1 <= height + 0.01
+    panels = [axes.get_tightbbox() for axes in figure.axes] + [legend.get_window_extent() for legend in figure.legends]
+    groups: list[Sequence[Bbox | None]] = [panels, *([text.get_window_extent() for text in axes.texts] for axes in figure.axes)]
+    for group in groups:
+        for one, other in combinations(group, 2):
+            assert one is not None
+            assert other is not None
+            assert min(one.x1, other.x1) - max(one.x0, other.x0) < 1 or min(one.y1, other.y1) - max(one.y0, other.y0) < 1
+
+
+@pytest.mark.parametrize("n_loops", [2, 3])
+def test_tracking_figure_draws_the_first_interactions_of_the_controlled_variables(n_loops: int) -> None:
+    table = response(n_loops)
+    figure = figures.tracking_figure(table, OUTPUTS[:n_loops], SET_POINTS[:n_loops], WORDS, n_samples=30)
+    assert len(figure.axes) == n_loops
+    for axes, variable in zip(figure.axes, OUTPUTS, strict=False):
+        lines = {line.get_label(): line for line in axes.lines}
+        assert set(lines) == {"controlled, agent", "controlled, expert", "set point"}
+        for controller in ("agent", "expert"):
+            expected = rows_of(table, controller, variable)["mean"][:31]
+            np.testing.assert_array_equal(lines[f"controlled, {controller}"].get_ydata(), expected)
+        assert DEVIATION in axes.get_ylabel().replace("\n", " ")
+    shown = texts(figure)
+    assert "after offline learning" in shown
+    assert "demonstrated" in shown
+    assert "manipulated" not in shown
+
+
+def test_a_response_without_a_variable_is_refused() -> None:
+    table = response()
+    with pytest.raises(ValueError, match="controller 'agent' and variable 'T_E'"):
+        draw(2, table.query("controller == 'expert' or variable != 'T_E'"))
+
+
+def several(table: pd.DataFrame, columns: list[str], n_seeds: int = 4) -> pd.DataFrame:
+    """The table for several seeds, its columns shifted by 0, 1, 2 and 10."""
+    shifts = (0.0, 1.0, 2.0, 10.0)[:n_seeds]
+    frames = [table.assign(seed=seed, **{name: table[name] + shift for name in columns}) for seed, shift in enumerate(shifts)]
+    return pd.concat(frames, ignore_index=True)
+
+
+def test_several_seeds_are_thin_lines_about_their_median() -> None:
+    table = response()
+    figure = draw(2, several(table, ["mean", "std"]))
+    expected = rows_of(table, "agent", "T")
+    panel = next(axes for axes in figure.axes if axes.get_label() == "B T")
+    (line,) = [line for line in panel.lines if line.get_label() == "controlled, agent"]
+    np.testing.assert_allclose(curve(line)[:, 1], expected["mean"] + 1.5)
+    thin = {label: paths for label, paths in ((c.get_label(), c.get_paths()) for c in panel.collections) if label == figures.SINGLE}
+    assert len(thin[figures.SINGLE]) == 4
+    summary = figures.drawn_summary(figure).query("panel == 'B T' and artist == @figures.SINGLE")
+    assert len(summary) == 8  # of expert and agent
+    assert np.isin(np.round(expected["mean"].max() + np.array([0.0, 1, 2, 10]), 9), summary["maximum"].round(9)).all()
+    band = next(c for c in panel.collections if c.get_label() == f"controlled, agent: {figures.BAND}")
+    edge = expected["mean"] + 1.5 + expected["std"] + 1.5
+    outline = np.asarray(band.get_paths()[0].vertices)[:, 1]
+    assert np.isclose(edge.to_numpy()[:, None], outline, rtol=0, atol=1e-9).any(1).all()
+    shown = texts(figure)
+    assert "medians over 4 seeds" in shown
+    assert "the mean of each seed" in shown
+
+
+def test_an_input_of_each_seed_is_held_until_the_next_sample() -> None:
+    figure = draw(2, several(response(), ["mean"], 2))
+    panel = next(axes for axes in figure.axes if axes.get_label() == "T_E")
+    thin = next(collection for collection in panel.collections if collection.get_label() == figures.SINGLE)
+    points = np.asarray(thin.get_paths()[0].vertices)
+    assert points[-1, 0] == N_STEPS
+    assert ((np.diff(points[:, 0]) == 0) | (np.diff(points[:, 1]) == 0)).all()
+
+
+def test_learning_curves_of_several_seeds_show_each_and_their_median() -> None:
+    table = history()
+    figure = figures.learning_curves(several(table, ["mean_return", "alpha:T-I"]), {40: "policy kept"})
+    returns, _, weights = figure.axes
+    np.testing.assert_allclose(curve(returns.lines[0])[:, 1], table["mean_return"] + 1.5)
+    np.testing.assert_allclose(curve(weights.lines[1])[:, 1], table["alpha:T-I"] + 1.5)
+    assert [len(axes.collections) for axes in figure.axes] == [1, 1, 6]
+    assert all(len(collection.get_paths()) == 4 for axes in figure.axes for collection in axes.collections)
+    assert "each of 4 seeds" in texts(figure)
+
+
+def budget() -> pd.DataFrame:
+    rows = [(s, c, n, c + s + n / 500) for s in range(3) for c in (1, 2) for n in (500, 20, 100)]
+    return pd.DataFrame(rows, columns=["seed", "case", "episodes_per_epoch", "objective"])
+
+
+def budget_figure() -> Figure:
+    levels = {"PID": 1.5, "offline policy": 1.2, "minimum variance on y": 5.0}
+    return figures.budget_figure(budget(), {1: levels, 2: levels}, {1: "Case Study I", 2: "Case Study II"})
+
+
+def test_the_budget_curve_shows_median_seeds_and_references() -> None:
+    figure = budget_figure()
+    first, second = figure.axes
+    for axes, case in ((first, 1), (second, 2)):
+        assert curve(axes.lines[0]).tolist() == pytest.approx(np.array([[n, case + 1 + n / 500] for n in (20, 100, 500)]))
+        assert [line.get_ydata()[0] for line in axes.lines[1:]] == [1.5, 1.2, 5.0]
+        assert len(axes.collections[0].get_paths()) == 3
+        assert axes.get_xscale() == "log"
+    shown = texts(figure)
+    for part in (
+        "Case Study II",
+        "plant episodes per epoch",
+        "PID",
+        "offline policy",
+        "minimum variance",
+        "each of 3 seeds",
+        "500",
+    ):
+        assert part in shown
+
+
+def test_learning_curves_draw_return_gap_and_every_weight() -> None:
+    table = history()
+    figure = figures.learning_curves(table, {40: "policy kept"}, {"PID": 3.0}, {"the paper": 0.037})
+    returns, gap, weights = figure.axes
+    np.testing.assert_array_equal(returns.lines[0].get_xydata(), table[["epochs", "mean_return"]])
+    np.testing.assert_array_equal(gap.lines[0].get_xydata(), table[["epochs", "feature_gap"]])
+    assert gap.get_yscale() == "log"
+    assert "%" in gap.get_ylabel()
+    labels = [r"$C_A^*$-I", "$T^*$-I", r"$C_A^*$-II", "$T^*$-II", r"$C_A^*$-III", "$T^*$-III"]
+    assert [line.get_label() for line in weights.lines[:6]] == labels
+    for line, column in zip(weights.lines, (name for name in table if name.startswith("alpha:")), strict=False):
+        np.testing.assert_array_equal(line.get_ydata(), table[column])
+    assert curve(returns.lines[1])[:, 1].tolist() == [3.0, 3.0]
+    assert curve(gap.lines[1])[:, 1].tolist() == [0.037, 0.037]
+    assert all(curve(axes.lines[-1])[:, 0].tolist() == [40, 40] for axes in figure.axes)
+    shown = texts(figure)
+    for part in (*labels, "PID", "the paper", "policy kept", "epoch", "discounted return"):
+        assert part in shown
+
+
+def test_each_feature_has_a_style_of_its_own() -> None:
+    styles = figures.feature_styles([f"{loop}-{kind}" for kind in ("I", "II", "III") for loop in OUTPUTS])
+    assert len({str(style) for style in styles.values()}) == len(styles) == 9
+
+
+@pytest.mark.parametrize("columns", [["epochs", "mean_return"], ["epochs", "mean_return", "feature_gap"]])
+def test_learning_curves_draw_what_the_history_holds(columns: list[str]) -> None:
+    figure = figures.learning_curves(history()[columns])
+    assert len(figure.axes) == len(columns) - 1
+    assert len(figures.learning_curves(history()[columns].assign(feature_gap=np.nan)).axes) == 1
+
+
+def test_the_drawings_name_what_they_show() -> None:
+    assert all(part in texts(drawings.mdp_figure()) for part in ("Controller", "Process", "u_t", "x_t", "y_{t+1}", "R_{t+1}"))
+    framework = texts(drawings.framework_figure())
+    for part in ("Offline", "Online", "Process data", "MaxEnt IRL", "REINFORCE", r"\alpha^*", "real objective", "new set point"):
+        assert part in framework
+    network = texts(drawings.network_figure((12, 34, 56), 3, 5, 0.02))
+    for part in (
+        "layer 3",
+        "12 cells",
+        "34 cells",
+        "56 cells",
+        "56 → 10",
+        "slope 0.02",
+        "ReLU6",
+        "(3)",
+        "(5)",
+        r"\sigma_t",
+        "u_{max}",
+    ):
+        assert part in network
+
+
+def test_drawn_summary_reads_back_what_was_drawn() -> None:
+    table = response()
+    summary = figures.drawn_summary(draw(2, table)).set_index(["panel", "artist"])
+    mean = rows_of(table, "agent", "T")["mean"].to_numpy()
+    row = summary.loc[("B T", "controlled, agent")]
+    assert row["points"] == N_STEPS + 1
+    assert (row["from"], row["to"]) == (0, N_STEPS)
+    assert row[["first", "minimum", "maximum", "mean", "last"]].tolist() == pytest.approx(
+        [mean[0], mean.min(), mean.max(), mean.mean(), mean[-1]]
+    )
+    assert summary.loc[("D T zoom", "set point"), "mean"] == 4.0
+    bands = [label for _, label in summary.index if "standard deviation" in label]
+    assert len(bands) == 12
+    assert len(summary) == 12 + 12 + 4
+
+
+@pytest.mark.parametrize(
+    ("variable", "column"),
+    [("T", "mean"), ("C_A0", "std")]
+    + [pytest.param(variable, "mean", marks=pytest.mark.torture) for variable in ("C_A", "C_A0", "T_E")]
+    + [pytest.param(variable, "std", marks=pytest.mark.torture) for variable in ("C_A", "T", "T_E")],
+)
+def test_drawn_summary_notices_a_change_of_one_percent(column: str, variable: str) -> None:
+    table = response()
+    before = figures.drawn_summary(draw(2, table)).select_dtypes("number")
+    changed = table.copy()
+    changed.loc[(changed["variable"] == variable) & (changed["controller"] == "agent"), column] *= 1.01
+    after = figures.drawn_summary(draw(2, changed)).select_dtypes("number")
+    assert not np.allclose(before, after, rtol=1e-5)
+
+
+def test_style_does_not_change_what_was_drawn() -> None:
+    plain = figures.drawn_summary(draw())
+    with matplotlib.rc_context({"lines.linewidth": 9, "axes.grid": False, "font.size": 5, "figure.dpi": 50}):
+        pd.testing.assert_frame_equal(figures.drawn_summary(draw()), plain)
+
+
+@pytest.mark.torture
+def test_svg_is_the_same_each_time_and_its_text_is_text(tmp_path: Path) -> None:
+    for name in ("one.svg", "two.svg"):
+        draw().savefig(tmp_path / name, metadata={"Date": None})
+    one = (tmp_path / "one.svg").read_text(encoding="utf-8")
+    assert one == (tmp_path / "two.svg").read_text(encoding="utf-8")
+    assert "control interaction (sample)" in one
+
+
+def test_figures_are_left_to_the_caller() -> None:
+    draw()
+    assert matplotlib.pyplot.get_fignums() == []

@@ -1,0 +1,260 @@
+"""What may become the committed reference run, and what goes into it."""
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from helpers.report import publish
+from helpers.report.publish import PublishError, check
+from helpers.runs.sources import PROJECT
+
+REVISION = "0123abcd" * 5
+GOOD = {"scale": "paper", "revision": REVISION, "revisions_of_stages": [REVISION], "seeds": [0, 1], "missing_seeds": []}
+OTHER = "f" * 40
+
+
+@pytest.mark.parametrize("reference", [None, {"seeds": [0]}, {"seeds": [0, 1]}], ids=["first", "more seeds", "as many"])
+def test_a_clean_run_at_paper_scale_is_accepted(reference):
+    check(GOOD, reference, REVISION)
+
+
+REFUSED = {
+    "smoke scale": ({"scale": "smoke"}, None, REVISION, "smoke scale"),
+    "fewer seeds": ({}, {"seeds": [0, 1, 2]}, REVISION, "2 seeds, the published one 3"),
+    "changed code now": ({}, None, REVISION + "+changes", "commit"),
+    "changed code then": ({"revision": REVISION + "+changes"}, None, REVISION, "+changes"),
+    "changed code all along": (
+        {"revision": REVISION + "+changes", "revisions_of_stages": [REVISION + "+changes"]},
+        None,
+        REVISION + "+changes",
+        "+changes",
+    ),
+    "one stage of changed code": ({"revisions_of_stages": [REVISION, REVISION + "+changes"]}, None, REVISION, "+changes"),
+    "a report of another commit": ({"revision": OTHER}, None, REVISION, OTHER),
+    "seeds that failed": ({"missing_seeds": [3, 7]}, None, REVISION, "lacks the seeds 3, 7"),
+    "another commit now": ({}, None, OTHER, OTHER),
+    "no checkout": ({"revision": "unknown", "revisions_of_stages": ["unknown"]}, None, "unknown", "unknown"),
+}
+
+
+@pytest.mark.parametrize(("changes", "reference", "revision", "says"), REFUSED.values(), ids=REFUSED)
+def test_other_runs_are_refused_in_one_sentence(changes, reference, revision, says):
+    with pytest.raises(PublishError) as caught:
+        check(GOOD | changes, reference, revision)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+# The command ---------------------------------------------------------------------------------------------------------
+
+README = (
+    "# Title\n<!-- glance: a -->\nold\n<!-- /glance -->\nmiddle\n"
+    "<!-- limits: c -->\n<!-- /limits -->\n<!-- time: b -->\n<!-- /time -->\nend\n"
+)
+
+
+GAPS = """\
+case,n_seeds,feature_gap,feature_gap_low,feature_gap_high,published_gap,expert_error,expert_error_low,expert_error_high,online_share,printed_gap
+1,20,0.2,0.15,0.31,0.1,0.01,0.009,0.012,0.951,0.4
+2,20,0.03,0.02,0.04,0.137,0.02,0.02,0.02,,
+"""
+
+
+@pytest.fixture
+def project(monkeypatch, tmp_path):
+    """A project with a finished run."""
+    latest, results = tmp_path / "reports/latest", tmp_path / "results"
+    files = {
+        latest / "report.html": "<html>",
+        latest / "report.md": "# not published",
+        latest / "figures/figure_3.png": "picture",
+        latest / "tables/table_2.csv": "a,b",
+        latest / "tables/time.csv": "case,stage,seconds\n1,demonstrations,2.4\n2,demonstrations,3.6\n1,offline_improved,20.2\n",
+        latest / "tables/gaps.csv": GAPS,
+        latest / "comparison.csv": "a,b",
+        latest / "seeds.csv": "case,seed,stage,metric,value\n1,0,offline,feature_gap,0.2\n",
+        latest / "provenance.json": json.dumps(GOOD),
+        latest / "notebooks/05_report.ipynb": "05",
+        results / "paper/seed_0/case_1/notebooks/02_offline_irl_improved.ipynb": "02",
+        results / "paper/seed_0/case_1/notebooks/02_offline_irl_printed.ipynb": "02 printed",
+        results / "paper/seed_0/case_3/notebooks/01_demonstrations.ipynb": "01",
+        results / "paper/seed_0/case_3/notebooks/.01_demonstrations.123.ipynb": "what a killed run left",
+        results / "paper/seed_1/case_3/notebooks/01_demonstrations.ipynb": "01 of another seed",
+        tmp_path / "README.md": README,
+    }
+    for path, text in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    places = {"PROJECT": tmp_path, "LATEST": latest, "REFERENCE": tmp_path / "reports/reference", "RESULTS": results}
+    for name, value in places.items():
+        monkeypatch.setattr(publish, name, value)
+    monkeypatch.setattr(publish, "code_revision", lambda _: REVISION)
+    return tmp_path
+
+
+def test_publishing_copies_the_report_and_the_executed_notebooks_of_the_first_seed(project):
+    old = project / "reports/reference/old.txt"
+    old.parent.mkdir()
+    old.write_text("of the run before")
+    (old.parent / "reliability.md").write_text("of make torture")
+    assert publish.main() == 0
+    reference = project / "reports/reference"
+    found = {str(path.relative_to(reference)) for path in reference.rglob("*") if path.is_file()}
+    assert found == {
+        *("report.html", "figures/figure_3.png", "tables/table_2.csv", "tables/time.csv", "tables/gaps.csv"),
+        *("comparison.csv", "seeds.csv", "provenance.json", "notebooks/05_report.ipynb"),
+        *("notebooks/02_offline_irl_case_1.ipynb", "notebooks/02_offline_irl_printed_case_1.ipynb"),
+        *("notebooks/01_demonstrations_case_3.ipynb", "reliability.md"),
+    }
+    assert (reference / "notebooks/01_demonstrations_case_3.ipynb").read_text() == "01"
+    assert sorted(path.name for path in (project / "reports").iterdir()) == ["latest", "reference"]
+
+
+def test_publishing_writes_the_numbers_into_readme(project):
+    assert publish.main() == 0
+    lines = (project / "README.md").read_text(encoding="utf-8").splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith(("| I ", "| II "))]
+    assert rows[0] == ["I", "1.0 % [0.9, 1.2]", "10.0 %", "20.0 % [15.0, 31.0]", "40.0 %", "95.1 %"]
+    assert rows[1] == ["II", "2.0 %", "13.7 %", "3.0 % [2.0, 4.0]", "–", "–"]
+    assert "(ours: medians and 95 % bootstrap intervals of the median over 20 seeds)" in lines
+    assert any("offline_improved" in line and " 20 " in line for line in lines)
+    kept = [line for line in lines if line in README.splitlines()]
+    assert kept == README.replace("old\n", "").splitlines()
+
+
+def test_the_gaps_to_the_optimum_of_the_sharpest_objective_are_written_where_they_were_run(project):
+    columns = 'controller,"I, $\\beta$ = 10","I, $\\beta$ = 30","III, $\\beta$ = 10","III, $\\beta$ = 30"'
+    rows = ["PID (demonstrator),1.0,2.0,3.0,4.5", 'offset-free MPC,5.0,"6.0 [5.0, 7.0]",7.0,8.0', "programme on x,0.0,0.0,0.0,0.0"]
+    (project / "reports/latest/tables/limits_gaps.csv").write_text("\n".join([columns, *rows, ""]))
+    assert publish.main() == 0
+    lines = (project / "README.md").read_text(encoding="utf-8").splitlines()
+    first = lines.index("<!-- limits: c -->") + 1
+    table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[first : lines.index("<!-- /limits -->")]]
+    assert table[0] == ["controller", "case I, %", "case III, %"]
+    assert table[2:] == [["PID (demonstrator)", "2.0", "4.5"], ["offset-free MPC", "6.0 [5.0, 7.0]", "8.0"]]
+
+
+@pytest.fixture
+def published(project):
+    """The same with an older reference, and a function that tells what every file holds."""
+    reference = project / "reports/reference"
+    (reference / "tables").mkdir(parents=True)
+    (reference / "provenance.json").write_text(json.dumps(GOOD | {"seeds": [0]}))
+
+    def content():
+        return {path: path.read_bytes() for path in project.rglob("*") if path.is_file()}
+
+    return project, content
+
+
+def refused(capsys, status):
+    """The one sentence with which publishing ends."""
+    assert publish.main() == status
+    said = capsys.readouterr().err
+    assert said.startswith("error: ")
+    assert said.count("\n") == 1
+    return said
+
+
+@pytest.mark.parametrize("fault", ["no report", "smoke", "no marks in README"])
+def test_a_refused_run_changes_nothing(published, capsys, fault):
+    project, content = published
+    provenance = project / "reports/latest/provenance.json"
+    if fault == "no report":
+        provenance.unlink()
+    elif fault == "smoke":
+        provenance.write_text(json.dumps(GOOD | {"scale": "smoke"}))
+    else:
+        (project / "README.md").write_text("no marks")
+    before = content()
+    refused(capsys, 2)
+    assert content() == before
+
+
+@pytest.mark.parametrize(
+    ("copy", "mark"),
+    [
+        ("results/paper/seed_0/case_1/notebooks/02_offline_irl_printed.ipynb", "02_offline_irl_printed.failed"),
+        ("reports/latest/notebooks/05_report.ipynb", "05_report.failed"),
+    ],
+)
+def test_a_copy_of_a_notebook_that_failed_is_not_published(published, capsys, copy, mark):
+    project, content = published
+    (project / copy).with_name(mark).write_text("02_offline_irl: ZeroDivisionError")
+    before = content()
+    assert f"{project / copy}: failed when it was run last" in refused(capsys, 2)
+    assert content() == before
+
+
+@pytest.mark.parametrize("table", ["claims.csv", "limits_gaps.csv"])
+def test_a_report_without_the_evidence_of_the_published_one_does_not_replace_it(published, capsys, table):
+    project, content = published
+    (project / "reports/reference/tables" / table).touch()
+    before = content()
+    assert f"the run lacks tables/{table}, which the published one has" in refused(capsys, 2)
+    assert content() == before
+    (project / "reports/latest/tables" / table).write_text('controller,"I, $\\beta$ = 30"\n')
+    assert publish.main() == 0
+
+
+@pytest.mark.parametrize("part", ["figures", "seeds.csv", "tables/time.csv", "notebooks/05_report.ipynb"])
+def test_a_report_that_lacks_a_part_ends_in_a_sentence_and_changes_nothing(published, capsys, part):
+    project, content = published
+    path = project / "reports/latest" / part
+    path.rename(project / "elsewhere")
+    before = content()
+    assert f"{path}: could not be published: No such file" in refused(capsys, 1)
+    assert content() == before
+    assert sorted(found.name for found in (project / "reports").iterdir()) == ["latest", "reference"]
+
+
+def test_a_folder_that_cannot_be_copied_ends_in_a_sentence(published, capsys):
+    project, content = published
+    (project / "reports/latest/figures/gone.png").symlink_to("nowhere")
+    before = content()
+    assert "figures/gone.png: could not be published: " in refused(capsys, 1)
+    assert content() == before
+
+
+@pytest.mark.parametrize("left", ["partial", "partial and reference aside", "reference aside, new one in place"])
+def test_a_kill_at_any_moment_loses_no_reference(published, capsys, left):
+    project, content = published
+    reports = project / "reports"
+    expected = content()
+    if "partial" in left:
+        (reports / ".reference.partial").mkdir()
+        (reports / ".reference.partial/report.html").touch()
+    if left == "partial and reference aside":
+        (reports / "reference").rename(reports / ".reference.old")
+    elif left.startswith("reference"):
+        (reports / ".reference.old").mkdir()
+        (reports / ".reference.old/provenance.json").touch()
+    (project / "reports/latest/provenance.json").rename(project / "provenance.json")  # so that nothing is published
+    refused(capsys, 2)
+    (project / "provenance.json").rename(project / "reports/latest/provenance.json")
+    assert content() == expected
+
+
+def test_a_reference_that_cannot_be_replaced_stays(published, capsys, monkeypatch):
+    _, content = published
+    before, rename = content(), Path.rename
+
+    def refusing(path, target):
+        if path.name == ".reference.partial":
+            raise OSError(28, "No space left on device", str(target))
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", refusing)
+    assert "No space left on device" in refused(capsys, 1)
+    assert content() == before
+
+
+def test_git_sees_nothing_of_what_a_kill_leaves_beside_the_reference():
+    """Otherwise the code would count as changed, and every later publishing be refused."""
+    left = [f"reports/.reference.{word}/report.html" for word in ("partial", "old")]
+    ignored = subprocess.run(["git", "check-ignore", "--no-index", *left], cwd=PROJECT, capture_output=True, text=True, check=False)
+    if ignored.returncode == 128:
+        pytest.skip("no checkout")
+    assert ignored.stdout.split() == left

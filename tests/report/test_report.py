@@ -1,0 +1,438 @@
+"""The report on the committed smoke results: complete, self-contained, readable, and refused when its input does not fit."""
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from itertools import product
+
+import pandas as pd
+import pytest
+
+from helpers.report import collection, report, scorecard
+from helpers.runs import freshness, identity
+from helpers.runs.artifacts import ArtifactError, save_stage
+from helpers.runs.sources import PROJECT
+
+CASES = (1, 2, 3)
+TABLE_OF_CASE = {1: 2, 2: 3, 3: 4}
+FEATURES = ["C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III"]
+COST = {"epochs", "episodes", "gradient_steps"}
+INPUTS, PARAMS = PROJECT / "notebooks/inputs", PROJECT / "params"
+VOID = {"meta", "link", "img", "br", "hr", "col", "input"}
+RESOURCES = {"src", "data", "srcset", "poster", "background"}
+
+
+def collect(root=INPUTS, params_root=PARAMS, n_seeds=1):
+    return collection.collect(root, params_root, "smoke", CASES, n_seeds)
+
+
+@pytest.fixture(scope="module")
+def results():
+    return collect()
+
+
+@pytest.fixture(scope="module")
+def written(results, tmp_path_factory):
+    """The folder of a report, written where an older one and files of the user were."""
+    folder = tmp_path_factory.mktemp("report") / "latest"
+    for old in ("notebooks/05_report.ipynb", "notes.txt", "figures/figure_9.png", "tables/table_9.csv"):
+        (folder / old).parent.mkdir(parents=True, exist_ok=True)
+        (folder / old).write_text("old")
+    assert report.write(folder, results) == folder / "report.html"
+    return folder
+
+
+class Page(HTMLParser):
+    """What a reader of an HTML page meets: its elements, and its text outside style sheets and TeX annotations."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements, self.text, self.open = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs), tuple(self.open)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs), tuple(self.open)))
+
+    def handle_endtag(self, tag):
+        while self.open and self.open.pop() != tag:
+            pass
+
+    def handle_data(self, data):
+        if not {"style", "annotation", "head"} & set(self.open):
+            self.text.append(data)
+
+    def named(self, tag):
+        return [(attributes, inside) for name, attributes, inside in self.elements if name == tag]
+
+
+@pytest.fixture(scope="module")
+def page(written):
+    return Page((written / "report.html").read_text(encoding="utf-8"))
+
+
+# report.html ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_report_opens_without_a_network(page):
+    assert page.named("script") == []
+    assert page.named("iframe") == []
+    assert page.named("link") == []
+    sources = [attributes[name] for _, attributes, _ in page.elements for name in RESOURCES & attributes.keys()]
+    assert sources
+    assert all(source.startswith("data:") for source in sources)
+    assert "@import" not in (page_text := "".join(str(attributes) for _, attributes, _ in page.elements))
+    assert "url(http" not in page_text
+
+
+def test_links_inside_the_report_lead_somewhere(page):
+    places = {attributes["id"] for _, attributes, _ in page.elements if "id" in attributes}
+    targets = [attributes["href"] for attributes, _ in page.named("a") if "href" in attributes]
+    assert len(targets) > 5
+    assert all(target.startswith("https://") or target[1:] in places for target in targets)
+
+
+def test_maths_is_typeset_and_no_markup_shows_through(page):
+    assert len(page.named("math")) > 20
+    text = "".join(page.text)
+    for markup in (r"\$", r"\\", r"\*\*", r"\|--", "{{", "{%", r"!\[", r"\bnan\b", r"\bNone\b", "undefined"):
+        assert re.search(f".*{markup}.*", text) is None
+
+
+def test_every_figure_has_a_caption_and_alternative_text(page):
+    images = page.named("img")
+    benchmarks = (report.BENCHMARKS / "scaling.svg").is_file()  # of make bench, shown where it was run
+    assert len(images) == 3 + 4 * len(CASES) + benchmarks
+    for attributes, inside in images:
+        assert len(attributes.get("alt", "").split()) > 5, attributes.get("alt")
+        assert "figure" in inside
+    assert len({attributes["alt"] for attributes, _ in images}) == len(images)
+    assert len(page.named("figcaption")) == len(page.named("figure")) == len(images)
+    text = " ".join("".join(page.text).split())
+    assert all(f"Figure {number}. " in text for number in (3, 4, 5, 6))
+
+
+def test_the_report_opens_with_one_page_to_stop_after(page):
+    """What was reproduced, what was not and what nobody could know stand before everything else."""
+    headings = [tag for tag, _, _ in page.elements if tag in ("h1", "h2")]
+    assert headings[:5] == ["h1", "h1", "h2", "h2", "h2"]
+    text = " ".join("".join(page.text).split())
+    places = [text.index(words) for words in ("What was reproduced", "What was not", "What nobody could know", "Student’s")]
+    assert places == sorted(places)
+    first_page = text[: places[-1]]
+    for part in ("one seed", "Feature gap, paper", "sampling time", "Inferred by us", "Chosen by us", "cannot tell"):
+        assert part in first_page
+
+
+def test_tables_are_tables_with_headers(page):
+    text = " ".join("".join(page.text).split())
+    assert all(f"Table {number}. " in text for number in (1, 2, 3, 4))
+    rows = [inside for tag, _, inside in page.elements if tag == "tr"]
+    assert len(page.named("table")) >= 8
+    assert all("table" in inside for inside in rows)
+    assert len(page.named("thead")) == len(page.named("table"))
+
+
+def test_every_parameter_stands_in_the_report_with_unit_source_and_status(results, written, page):
+    leaves = {(leaf["file"], leaf["key"]): leaf for params in results.params.values() for leaf in params.leaves}
+    table = pd.read_csv(written / "tables/parameters.csv", dtype=str, keep_default_na=False)
+    assert set(zip(table["file"], table["key"], strict=True)) == leaves.keys()
+    assert (table[["value", "unit", "source", "status"]] != "").all(axis=None)
+    assert set(table["status"]) <= {"reported", "inferred", "assumed"}
+    text = " ".join("".join(page.text).split())
+    assert all(key in text for _, key in leaves)
+
+
+def test_the_report_says_where_it_comes_from_and_that_smoke_means_nothing(written, page):
+    text = " ".join("".join(page.text).split())
+    origin = json.loads((written / "provenance.json").read_text())
+    assert {"scale", "seeds", "revision", "revisions_of_stages", "versions", "parameters"} <= origin.keys()
+    assert origin["scale"] == "smoke"
+    assert origin["seeds"] == [0]
+    assert sorted(origin["parameters"]) == ["1", "2", "3"]
+    for part in (origin["revision"], f"torch {origin['versions']['torch']}", "Its numbers mean nothing", "Errata", "Deviations"):
+        assert part in text
+
+
+# The files beside it -------------------------------------------------------------------------------------------------
+
+
+def test_every_figure_and_table_of_the_paper_has_its_files(written):
+    figures = [f"figure_{number}" for number in range(1, 7)]
+    figures += ["network", *(f"{curves}_curves_case_{case}" for curves in ("learning", "online") for case in CASES)]
+    assert all((written / "figures" / f"{name}.svg").stat().st_size > 1000 for name in figures)
+    assert [path.name for path in (written / "figures").glob("*.png")] == ["figure_3.png"]  # which README shows
+    for number, ending in product((1, 2, 3, 4), ("csv", "md")):
+        assert (written / "tables" / f"table_{number}.{ending}").stat().st_size > 100
+    for number in (2, 3, 4):
+        table = pd.read_csv(written / f"tables/table_{number}.csv")
+        assert table["source"].tolist() == ["published", "reproduced", "verdict"] * 3
+        assert table[FEATURES].notna().all(axis=None)
+
+
+def test_what_an_older_report_left_is_replaced_and_other_files_stay(written):
+    assert (written / "notes.txt").read_text() == (written / "notebooks/05_report.ipynb").read_text() == "old"
+    assert not (written / "figures/figure_9.png").exists()
+    assert not (written / "tables/table_9.csv").exists()
+    assert [path.name for path in written.iterdir() if path.name.startswith(".")] == []
+
+
+def test_comparison_has_one_row_for_each_published_number(written):
+    table = pd.read_csv(written / "comparison.csv")
+    assert list(table) == scorecard.COLUMNS
+    keys = [(TABLE_OF_CASE[case], case, row, name) for case, row, name in product(CASES, ("expert", "policy", "alpha"), FEATURES)]
+    assert len(table) == 54
+    assert set(table[["table", "case", "row", "feature"]].itertuples(index=False, name=None)) == set(keys)
+    assert (table["n_seeds"] == 1).all()
+    assert table[["published", "reproduced"]].notna().all(axis=None)
+    assert table[["ci_low", "ci_high", "pred_low", "pred_high"]].isna().all(axis=None)
+    assert set(table["verdict"]) == {"fitted", "cannot tell"}
+    assert set(table["reason"]) == {"one seed"}
+    found = table.set_index(["case", "row", "feature"])
+    assert found.loc[(1, "expert", "C_A-I"), "published"] == 21.63  # Table 2, first and last number of the paper
+    assert found.loc[(3, "alpha", "T-III"), "published"] == -0.541
+    for row, folder, metric in (
+        ("expert", "demonstrations", "v:T-II"),
+        ("policy", "transfer_improved", "v:T-II"),
+        ("alpha", "transfer_improved", "alpha:T-II"),
+    ):
+        scores = pd.read_csv(INPUTS / "smoke/seed_0/case_3" / folder / "scores.csv").set_index("metric")["value"]
+        assert found.loc[(3, row, "T-II"), "reproduced"] == pytest.approx(scores[metric], rel=1e-9)
+
+
+def test_seeds_hold_the_metrics_of_every_stage(written):
+    table = pd.read_csv(written / "seeds.csv")
+    assert list(table) == ["case", "seed", "stage", "metric", "value"]
+    assert table["metric"][table["value"].isna()].str.startswith("rise_time:").all()  # a loop may never arrive
+    assert not table.duplicated(["case", "seed", "stage", "metric"]).any()
+    v, alpha = ({f"{kind}:{name}" for name in FEATURES} for kind in ("v", "alpha"))
+    expected = {
+        "expert": v | {"objective"},
+        "offline": v | alpha | COST | {"feature_gap", "objective"},
+        "online": v | COST | {"objective", "share"},
+        "minimum_variance": v | {"objective"},
+    }
+    for case, (stage, metrics) in product(CASES, expected.items()):
+        assert metrics <= set(table.query("case == @case and stage == @stage")["metric"]), (case, stage)
+    assert table.query("metric == 'episodes'")["value"].gt(0).all()
+
+
+# What does not fit ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def inputs(tmp_path, monkeypatch):
+    """A copy of the committed results, for which the same holds: another commit made them, on another machine."""
+    monkeypatch.setattr(freshness, "COMMITTED", tmp_path / "inputs")
+    return shutil.copytree(INPUTS, tmp_path / "inputs")
+
+
+def origin(notebook, case, seed, variant="improved", upstream=None):
+    """The part of a record that says where a result comes from, as if it had been made now."""
+    run = {"notebook": notebook, "case": case, "seed": seed, "scale": "smoke", "variant": variant}
+    made_from, upstream = identity.inputs(notebook, PARAMS, "smoke", case, variant), upstream or {}
+    return run | {"inputs": made_from, "upstream": upstream, "identity": identity.identity(run, made_from, upstream)}
+
+
+@pytest.fixture
+def own(tmp_path):
+    """The same results, as if the present code had made them on this machine."""
+    folder = shutil.copytree(INPUTS, tmp_path / "own")
+    for path in folder.rglob("record.json"):
+        record = json.loads(path.read_text())
+        now = origin(*(record[name] for name in ("notebook", "case", "seed", "variant", "upstream")))
+        path.write_text(json.dumps(record | now))
+    return folder
+
+
+def refusal(*arguments):
+    with pytest.raises(ArtifactError) as caught:
+        collect(*arguments)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("missing", "says"),
+    [
+        ("case_2/demonstrations", "notebook 01 for case 2 and seed 0"),
+        ("case_1/offline_printed", "notebook 02 for case 1 and seed 0"),
+        ("case_3/transfer_improved", "notebook 04 for case 3 and seed 0"),
+        ("case_3/online_improved", "notebook 03 (04 for the transfer case) for case 3 and seed 0"),
+    ],
+)
+def test_a_missing_stage_names_its_file_and_what_to_run(inputs, missing, says):
+    shutil.rmtree(inputs / "smoke/seed_0" / missing)
+    path = inputs / "smoke/seed_0" / missing / "record.json"
+    assert refusal(inputs) == f"{path}: this result is missing; run {says} first"
+
+
+def test_a_seed_that_was_not_run_is_named(inputs):
+    assert "seed_1/case_1/demonstrations/record.json" in refusal(inputs, PARAMS, 2)
+
+
+@pytest.fixture
+def several(inputs):
+    """Six seeds that differ by their number in one feature of the offline policy, and are alike otherwise."""
+    for seed in range(1, 6):
+        shutil.copytree(inputs / "smoke/seed_0", inputs / f"smoke/seed_{seed}")
+    return inputs
+
+
+def test_several_seeds_are_compared_by_median_and_intervals(several):
+    results = collect(several, PARAMS, 6)
+    assert set(results.seeds["seed"]) == set(range(6))
+    rows = results.seeds.query("case == 1 and stage == 'offline' and metric == 'v:T-I'")
+    results.seeds.loc[rows.index, "value"] = [9.0, 1.0, 2.0, 4.0, 3.0, 5.0]
+    table = report.tabulate(results)["comparison"]
+    assert set(table["n_seeds"]) == {6}
+    assert table[["ci_low", "ci_high", "pred_low", "pred_high"]].notna().all(axis=None)
+    row = table.set_index(["case", "row", "feature"]).loc[(1, "policy", "T-I")]
+    assert row["reproduced"] == 3.5
+    assert 1.0 <= row["ci_low"] < 3.5 < row["ci_high"] <= 9.0
+    middle, s = 4.0, 8.0**0.5
+    reach = 2.570582 * s * (7 / 6) ** 0.5  # t of five degrees of freedom; 100 trajectories carry more than the error of 500
+    assert row[["pred_low", "pred_high"]].tolist() == pytest.approx([middle - reach, middle + reach], rel=1e-6)
+
+
+def test_what_went_well_is_said_where_the_limits_were_not_run(results, monkeypatch):
+    """The smoke run reaches nothing, so the words for better results are asked for."""
+    monkeypatch.setattr(report, "_better", lambda _: {"gap": [1, 2], "worse_as_printed": [2], "online": [1]})
+    text = report.render(results, report.tabulate(results), report.provenance(results))
+    assert "in Case Studies I and II the learned policy lies nearer" in text
+    assert "in Case Study I online learning lifts the objective above the PID's.\n" in text
+    assert "It has its price" not in text
+
+
+def test_claims_trials_and_budget_appear_where_they_were_run(results, several):
+    trial = next(iter(results.params[1].trials))
+    assert not {"claims", "trials"} & report.tabulate(results).keys()
+    for seed, case in product(range(6), CASES):
+        folder = several / f"smoke/seed_{seed}/case_{case}"
+        made = origin("08_claims", case, seed) | {"revision": "abc", "seconds": 1.0}
+        save_stage(folder / "experiments", made, {"scores.csv": pd.DataFrame({"stage": ["x"], "metric": ["y"], "value": [1.0]})})
+        budget = pd.DataFrame({"episodes_per_epoch": [20, 500], "objective": [9.0 + seed, 12.0 + seed]})
+        save_stage(folder / "online_budget", made, {"scores.csv": budget})
+        scores = pd.DataFrame({"stage": ["offline"], "metric": ["feature_gap"], "value": [0.1 + seed / 100]})
+        made |= origin("04_knowledge_transfer" if case == 3 else "02_offline_irl", case, seed, trial)
+        save_stage(folder / f"{'transfer' if case == 3 else 'offline'}_{trial}", made, {"scores.csv": scores})
+    results = collect(several, PARAMS, 6)
+    drawn = report.draw(results)
+    assert "online_budget" in drawn
+    tabulated = report.tabulate(results)
+    sources = ["published", "reproduced", "interval of median", "interval of one run", "verdict"]
+    assert tabulated["table_3"]["source"].tolist() == sources * 3
+    trials = tabulated["trials"].set_index("trial")
+    assert trials.loc[trial, "case II, %"] == "12.5 (10.0 to 15.0; 6 seeds)"
+    assert list(trials.index) == ["improved", "printed", trial]
+    assert {"id", "statement", "verdict", "reason"} <= set(tabulated["claims"])
+    text = report.render(results, tabulated, report.provenance(results))
+    for part in ("with 6 seeds", "95 % bootstrap interval", "# What was tried offline", "# The paper's claims", "# Plant episodes"):
+        assert part in text
+    assert re.search(r"\bnan\b|\{\{|\{%", text) is None
+    for link in re.findall(r"\]\((figures/[^)]+)\)", text):
+        assert link.removeprefix("figures/").removesuffix(".svg") in {*drawn, "benchmarks"}
+
+
+def test_a_stage_made_with_other_parameters_is_refused_by_name(inputs, tmp_path):
+    params = shutil.copytree(PARAMS, tmp_path / "params")
+    case = params / "case_2.yaml"
+    case.write_text(case.read_text().replace("value: 250", "value: 249"))
+    sentence = refusal(inputs, params)
+    assert "case_2/demonstrations/record.json" in sentence
+    assert "(changed: params/case_2.yaml)" in sentence
+    assert "case_1/demonstrations" not in sentence
+
+
+def test_a_record_without_its_origin_is_refused(inputs):
+    path = inputs / "smoke/seed_0/case_1/demonstrations/record.json"
+    record = json.loads(path.read_text())
+    for left in ({}, {"notebook": "01_demonstrations", "case": 1}):
+        path.write_text(json.dumps({"files": record["files"]} | left))
+        assert str(path) in refusal(inputs)
+
+
+MIXTURES = {
+    "a module": (("inputs", "src/helpers/learning/lstm.py"), "src/helpers/learning/lstm.py"),
+    "a package": (("inputs", "torch"), "torch"),
+    "a notebook": (("inputs", "notebooks/02_offline_irl.ipynb"), "notebooks/02_offline_irl.ipynb"),
+    "a parameter file": (("inputs", "params/learning.yaml"), "params/learning.yaml"),
+    "an earlier result": (("upstream", "case_2/demonstrations"), "seed_0/case_2/demonstrations"),
+    "another seed": (("seed",), "the record itself"),
+}
+
+
+FAST = ("a module", "an earlier result", "another seed")
+
+
+@pytest.mark.parametrize(
+    ("entry", "says"),
+    [pytest.param(*case, id=name, marks=() if name in FAST else pytest.mark.torture) for name, case in MIXTURES.items()],
+)
+def test_a_mixture_is_refused_naming_the_result_and_what_changed(own, entry, says):
+    path = own / "smoke/seed_0/case_2/offline_improved/record.json"
+    whole = json.loads(path.read_text())
+    part = whole
+    for name in entry[:-1]:
+        part = part[name]
+    assert entry[-1] in part
+    part[entry[-1]] = 7
+    assert collect(own).n_seeds == 1
+    path.write_text(json.dumps(whole))
+    sentence = refusal(own)
+    assert f"{path} (changed: {says})" in sentence
+    assert sentence.count("record.json") == 1
+
+
+def test_limits_of_other_inputs_are_refused_and_a_part_alone_is_none(own):
+    folder = own / "smoke/seed_0/case_1"
+    for part in collection.LIMITS[:-1]:
+        shutil.copytree(folder / "online_improved", folder / f"limits_{part}")
+    assert collect(own).limits == {}
+    shutil.copytree(folder / "online_improved", folder / "limits_safety")
+    results = collect(own)
+    assert set(results.limits) == {(1, 0, part) for part in collection.LIMITS}
+    records = [stage.record["seconds"] for stage in (*results.stages.values(), *results.limits.values())]
+    assert report.provenance(results)["stage_seconds"] == pytest.approx(sum(records))
+    path = folder / "limits_budget/record.json"
+    record = json.loads(path.read_text())
+    record["inputs"]["params/learning.yaml"] = 7
+    path.write_text(json.dumps(record))
+    assert f"{path} (changed: params/learning.yaml)" in refusal(own)
+
+
+def test_seeds_with_missing_stages_are_left_out_only_when_asked_and_the_report_says_so(several, tmp_path):
+    shutil.rmtree(several / "smoke/seed_2/case_3/transfer_improved")
+    with pytest.raises(ArtifactError, match="seed_2/case_3/transfer_improved"):
+        collect(several, PARAMS, 6)
+    results = collection.collect(several, PARAMS, "smoke", CASES, 6, missing_allowed=True)
+    assert (results.missing, results.n_seeds, set(results.seeds["seed"])) == ((2,), 5, {0, 1, 3, 4, 5})
+    origin = report.provenance(results)
+    assert origin["missing_seeds"] == [2]
+    text = report.render(results, report.tabulate(results), origin)
+    assert "shows 5 of 6 seeds: a stage of seed 2 failed or was not run" in text
+    for seed in (0, 1, 3, 4, 5):
+        shutil.rmtree(several / f"smoke/seed_{seed}/case_1/demonstrations")
+    with pytest.raises(ArtifactError, match="seed_0/case_1/demonstrations"):  # none is whole
+        collection.collect(several, PARAMS, "smoke", CASES, 6, missing_allowed=True)
+
+
+@pytest.mark.parametrize("broken", ["draw", "tabulate", "render", "typeset"])
+def test_a_report_that_fails_leaves_the_older_one_alone(results, tmp_path, monkeypatch, broken):
+    def fail(*_):
+        raise RuntimeError(broken)
+
+    for name, stand_in in (("draw", lambda _: {}), ("render", lambda *_: ""), (broken, fail)):
+        monkeypatch.setattr(report, name, stand_in)
+    for old in ("report.html", "figures/figure_3.svg"):
+        (tmp_path / old).parent.mkdir(exist_ok=True)
+        (tmp_path / old).write_text("old")
+    with pytest.raises(RuntimeError, match=broken):
+        report.write(tmp_path, results)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["figure_3.svg", "figures", "report.html"]
+    assert (tmp_path / "report.html").read_text() == "old"

@@ -1,0 +1,281 @@
+"""The verdict rule and its edges, and medians, gaps and lists against cases built by hand."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import bootstrap
+
+from helpers.report import scorecard
+from helpers.settings.paper import PublishedCase, load_published
+
+PARAMS = Path(__file__).resolve().parents[2] / "params"
+FEATURES = ["C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III"]
+TWO = ["h-I", "h-II"]
+SMALL = {4: PublishedCase(table=9, expert=(10.0, -2.0), policy=(11.0, -2.5), alpha=(0.6, -0.8))}
+MEASURED = {"expert": 20000, "policy": 2000}
+SPREAD = 3.0  # of the features over trajectories
+
+
+def seeds(n_seeds: int = 6) -> pd.DataFrame:
+    """Case 4: policies at 11 and 2.0 more or less; the last seed lacks its weights."""
+    rows = []
+    for seed in range(n_seeds):
+        shift = 0.1 * (seed - (n_seeds - 1) / 2)
+        rows += [
+            (4, seed, "expert", "v:h-I", 10.5 + shift),
+            (4, seed, "expert", "v:h-II", -2.2),
+            (4, seed, "offline", "v:h-I", 11.0 + shift),
+            (4, seed, "offline", "v:h-II", -2.0),
+            (4, seed, "online", "v:h-I", 99.0),
+            (4, seed, "offline", "feature_gap", 0.02 + seed / 100),
+            (4, seed, "online", "objective_x", 9.0 + seed / 10),
+            (4, seed, "minimum_variance", "objective_x", 10.0),
+            (1, seed, "offline", "feature_gap", 0.9),
+        ]
+        rows += [(4, seed, stage, f"v:{name}:std", SPREAD) for stage in ("expert", "offline") for name in TWO]
+        if seed < n_seeds - 1:
+            rows += [(4, seed, "offline", "alpha:h-I", 0.61 + shift / 10), (4, seed, "offline", "alpha:h-II", -0.7)]
+    return pd.DataFrame(rows, columns=["case", "seed", "stage", "metric", "value"])
+
+
+def compare(runs: pd.DataFrame, published=None, names=None) -> pd.DataFrame:
+    return scorecard.comparison(published or SMALL, runs, scorecard.summary(runs), names or TWO, MEASURED)
+
+
+# The rule ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("published", "low", "high", "expected", "reason"),
+    [
+        (10.0, 9.0, 11.0, "match", "inside 9.00 to 11.00"),
+        (10.0, 10.0, 11.0, "match", "inside 10.00 to 11.00"),  # an end belongs to the interval
+        (10.0, 9.0, 10.0, "match", "inside 9.00 to 10.00"),
+        (10.0, 10.01, 11.0, "differs", "0.01 below the interval"),
+        (10.0, 9.0, 9.6, "differs", "0.4 above the interval"),
+        (-10.0, -9.6, -9.0, "differs", "0.4 below the interval"),
+        (10.0, 7.5, 12.5, "match", "inside 7.50 to 12.50"),  # a quarter to either side still tells
+        (10.0, 7.49, 12.51, "cannot tell", "one run scatters by 2.5 to either side of 10.00"),
+        (-10.0, -12.51, -7.49, "cannot tell", "one run scatters by 2.5 to either side of -10.00"),
+        (-10.0, -12.5, -7.5, "match", "inside -12.50 to -7.50"),
+        (10.0, 12.0, 17.2, "cannot tell", "one run scatters by 2.6 to either side of 14.60"),  # outside, but too wide
+    ],
+)
+def test_the_verdict_and_its_reason(published, low, high, expected, reason):
+    assert scorecard.verdict("policy", published, 20, low, high) == (expected, reason)
+
+
+def test_the_expert_is_fitted_whatever_its_interval_says():
+    assert scorecard.verdict("expert", 10.0, 20, 9.0, 9.6) == ("fitted", "0.4 above the interval")
+    assert scorecard.verdict("expert", 10.0, 20, 0.0, 20.0) == ("fitted", "inside 0.00 to 20.00")
+    assert scorecard.verdict("expert", 10.0, 1, np.nan, np.nan) == ("fitted", "one seed")
+
+
+def test_one_seed_cannot_tell():
+    assert scorecard.verdict("policy", 10.0, 1, np.nan, np.nan) == ("cannot tell", "one seed")
+    assert scorecard.verdict("alpha", 10.0, 0, np.nan, np.nan) == ("cannot tell", "no seed gave it")
+    assert scorecard.verdict("alpha", 0.5, 2, 0.4, 0.501)[1] == "inside 0.400 to 0.501"
+
+
+# Medians and intervals -----------------------------------------------------------------------------------------------
+
+
+def test_summary_has_the_median_and_its_interval_for_every_number():
+    runs = seeds(7)
+    runs.loc[(runs["metric"] == "feature_gap") & (runs["case"] == 1) & (runs["seed"] == 2), "value"] = np.nan
+    found = scorecard.summary(runs).set_index(["case", "stage", "metric"])
+    assert len(found) == len(runs.drop_duplicates(["case", "stage", "metric"]))
+    assert found.loc[(1, "offline", "feature_gap"), "n_seeds"] == 6
+    assert found.loc[(4, "offline", "alpha:h-I"), "n_seeds"] == 6
+    row = found.loc[(4, "offline", "feature_gap")]
+    values = 0.02 + np.arange(7) / 100
+    assert row[["median", "least", "greatest"]].tolist() == pytest.approx([0.05, 0.02, 0.08])
+    assert row["p90"] == pytest.approx(0.074)
+    resampled = bootstrap((values,), np.median, method="percentile", n_resamples=4000, rng=np.random.default_rng(5))
+    assert row[["ci_low", "ci_high"]].tolist() == pytest.approx(list(resampled.confidence_interval), abs=1e-12)
+
+
+def test_comparison_holds_intervals_of_the_median_and_of_one_run():
+    table = compare(seeds())
+    assert list(table.columns) == scorecard.COLUMNS
+    assert table[["table", "case", "row", "feature", "published", "n_seeds"]].to_numpy().tolist() == [
+        [9, 4, "expert", "h-I", 10.0, 6],
+        [9, 4, "expert", "h-II", -2.0, 6],
+        [9, 4, "policy", "h-I", 11.0, 6],
+        [9, 4, "policy", "h-II", -2.5, 6],
+        [9, 4, "alpha", "h-I", 0.6, 5],
+        [9, 4, "alpha", "h-II", -0.8, 5],
+    ]
+    assert table["reproduced"].tolist() == pytest.approx([10.5, -2.2, 11.0, -2.0, 0.605, -0.7])
+    assert table["verdict"].tolist() == ["fitted", "fitted", "match", "differs", "match", "differs"]
+    assert table.loc[3, ["ci_low", "ci_high"]].tolist() == [-2.0, -2.0]
+
+
+def test_the_sampling_error_that_ours_lack_is_added_to_features_only():
+    """Six runs that are all alike leave the sampling error of 500 trajectories less that of K; normal, so 1.96 of it."""
+    table = compare(seeds()).set_index(["row", "feature"])
+    for row, measured in MEASURED.items():
+        reach = 1.959964 * SPREAD * (1 / 500 - 1 / measured) ** 0.5
+        numbers = table.loc[(row, "h-II")]
+        assert numbers["pred_high"] - numbers["reproduced"] == pytest.approx(reach, rel=1e-6)
+        assert numbers["reproduced"] - numbers["pred_low"] == pytest.approx(reach, rel=1e-6)
+    assert table.loc[("alpha", "h-II"), ["pred_low", "pred_high"]].tolist() == pytest.approx([-0.7, -0.7])
+    fewer = scorecard.comparison(SMALL, seeds(), scorecard.summary(seeds()), TWO, {"expert": 500, "policy": 100})
+    assert fewer.loc[3, ["pred_low", "pred_high"]].tolist() == [-2.0, -2.0]  # never less than the runs' own
+
+
+def test_another_sampling_error_may_change_a_verdict():
+    """The policy's h-III is printed 0.5 below ours: beyond 1.96 x 0.13 (its own error), within 1.96 x 0.3 (that of the fit)."""
+    names = ["h-I", "h-III"]
+    printed = {4: PublishedCase(table=9, expert=(10.0, -2.0), policy=(11.0, -2.5), alpha=(0.6, -0.8))}
+    runs = seeds()
+    runs["metric"] = runs["metric"].str.replace("h-II", "h-III")
+    prediction = pd.DataFrame(
+        {"table": [9, 9, 8], "feature": ["h-III", "h-I", "h-III"], "published": -2.0, "simulated": -1.7, "deviation": 1.0}
+    )
+    errors = scorecard.sampling_errors(prediction, printed)
+    assert errors == {(4, "h-III"): pytest.approx(0.3)}
+    ours, wider = (scorecard.comparison(printed, runs, scorecard.summary(runs), names, MEASURED, found) for found in (None, errors))
+    found = scorecard.changed(ours, wider)
+    assert found[["row", "feature", "verdict", "verdict_with_the_wider_error"]].to_numpy().tolist() == [
+        ["policy", "h-III", "differs", "match"]
+    ]
+    assert scorecard.outside(ours) == {"match": 0, "differs": 2, "cannot tell": 0, "fitted": 0}
+
+
+def test_a_number_that_is_nan_in_every_seed_is_one_that_no_seed_gave():
+    runs = seeds()
+    runs.loc[runs["metric"] == "alpha:h-II", "value"] = np.nan
+    row = compare(runs).iloc[5]
+    assert (row["n_seeds"], row["verdict"], row["reason"]) == (0, "cannot tell", "no seed gave it")
+
+
+def test_comparison_has_a_row_for_each_published_number_even_if_nobody_reproduced_it():
+    published = {case: load_published(PARAMS)[case] for case in (1, 2, 3)}
+    table = compare(seeds().query("case == 1"), published, FEATURES)
+    assert len(table) == 54
+    assert table[["reproduced", "ci_low", "pred_high"]].isna().all(axis=None)
+    assert (table["n_seeds"] == 0).all()
+    assert set(table["verdict"]) == {"fitted", "cannot tell"}
+    assert set(table["reason"]) == {"no seed gave it"}
+    assert not table.duplicated(["table", "case", "row", "feature"]).any()
+    assert table.query("table == 3 and row == 'alpha' and feature == 'T-III'")["published"].tolist() == [-0.545]
+    assert table.query("case == 3 and row == 'policy' and feature == 'C_A-II'")["published"].tolist() == [9.37]
+
+
+def with_ratios(runs: pd.DataFrame, published=None, names=None) -> pd.DataFrame:
+    return pd.concat([runs, scorecard.relative(runs, published or SMALL, names or TWO)], ignore_index=True)
+
+
+def test_ratios_of_each_seed():
+    added = scorecard.relative(seeds(2), SMALL, TWO).set_index(["stage", "metric", "seed"])["value"]
+    assert added["expert", "published_error", 0] == pytest.approx((0.45 / 10 + 0.2 / 2) / 2)
+    assert added["expert", "published_error", 1] == pytest.approx((0.55 / 10 + 0.2 / 2) / 2)
+    assert added["online", "share", 1] == pytest.approx(0.91)
+    assert added["minimum_variance", "share", 0] == 1.0
+    assert len(added) == 6
+
+
+def test_gaps():
+    row = scorecard.gaps(scorecard.summary(with_ratios(seeds())), SMALL).iloc[0]
+    assert (row["case"], row["n_seeds"]) == (4, 6)
+    assert row[["feature_gap", "feature_gap_greatest"]].tolist() == pytest.approx([0.045, 0.07])
+    assert 0.02 <= row["feature_gap_low"] < 0.045 < row["feature_gap_high"] <= 0.07
+    assert row["published_gap"] == pytest.approx((1 / 10 + 0.5 / 2) / 2)
+    assert row["expert_error"] == pytest.approx((0.5 / 10 + 0.2 / 2) / 2)
+    assert row["online_share"] == pytest.approx(0.925)
+    assert row["online_share_low"] < 0.925 < row["online_share_high"]
+
+
+def test_gaps_of_the_paper_and_of_seeds_that_are_missing():
+    published = {case: load_published(PARAMS)[case] for case in (1, 2, 3)}
+    table = scorecard.gaps(scorecard.summary(with_ratios(seeds(1).query("case == 4"), published, FEATURES)), published)
+    assert (100 * table["published_gap"]).round(1).tolist() == [3.7, 13.7, 11.5]
+    assert table["n_seeds"].tolist() == [0, 0, 0]
+    assert table[["feature_gap", "expert_error", "online_share"]].isna().all(axis=None)
+
+
+# Lists for the opening page ------------------------------------------------------------------------------------------
+
+
+def test_counts_and_lists_of_verdicts():
+    table = compare(seeds())
+    counts = scorecard.counts(table)
+    assert list(counts) == ["published numbers", "match", "differs", "cannot tell", "fitted"]
+    assert counts.to_numpy()[:, 1:].tolist() == [[0, 0, 0, 2], [1, 1, 0, 0], [1, 1, 0, 0]]
+    assert scorecard.listing(table, "differs") == "Case Study IV: features of the policy $h^*$\u2011II; weights $h^*$\u2011II"
+    assert scorecard.listing(table, "fitted") == "Case Study IV: all features of the expert"
+    assert scorecard.listing(table, "cannot tell") == ""
+
+
+def test_features_that_differ_and_lie_nearer_to_the_printed_expert_are_counted():
+    """h-II of the policy: printed 2.5, ours 2.0, the printed expert 2.0; h-I matches."""
+    table = compare(seeds())
+    assert scorecard.nearer_to_expert(table) == 1
+    table.loc[3, "reproduced"] = -2.6
+    assert scorecard.nearer_to_expert(table) == 0
+
+
+def test_settings_fitted_to_one_table_predict_the_other():
+    columns = ["fitted_on", "table", "deviation", "relative_error"]
+    prediction = pd.DataFrame(
+        [
+            ["Table 2 and 4", 2, 1.0, 0.01],
+            ["Table 2 and 4", 2, -3.0, -0.03],
+            ["Table 2", 2, 0.5, 0.01],
+            ["Table 2", 4, 2.0, -0.04],
+            ["parameter files", 4, 2.0, 0.02],
+        ],
+        columns=columns,
+    )
+    found = scorecard.held_out(prediction)
+    assert found["role"].tolist() == ["fit", "fit", "prediction", "fit"]
+    first = found.iloc[0]
+    assert first["mean_error, %"] == pytest.approx(2.0)
+    assert first["greatest_error, %"] == pytest.approx(3.0)
+    assert first["greatest_deviation"] == 3.0
+
+
+def test_trials_are_compared_with_the_headline_on_their_seeds():
+    """Seeds differ more than the trials do; of four seeds nothing is said."""
+    rows = [("improved", case, seed, 0.1 * (seed + 1)) for case in (1, 2) for seed in range(9)]
+    rows += [("x", 1, seed, 0.1 * (seed + 1) - 0.01) for seed in range(5)]
+    rows += [("x", 2, seed, 0.1 * (seed + 1) + 0.01) for seed in range(5)]
+    rows += [("y", 1, seed, 0.0) for seed in range(4)]
+    trials = pd.DataFrame(rows, columns=["trial", "case", "seed", "gap"])
+    assert scorecard.against_headline(trials) == {"x": "better in I; worse in II", "y": "–"}
+
+
+def test_claims_are_put_together_over_cases_and_quantities():
+    rows = [
+        ("a", 1, "x", "holds"),
+        ("a", 2, "x", "holds"),
+        ("b", 1, "x", "holds"),
+        ("b", 2, "x", "does not hold"),
+        ("c", 1, "x", "does not hold"),
+        ("c", 3, "x", "cannot tell"),
+        ("d", 1, "x", "holds"),
+        ("d", 1, "y", "cannot tell"),
+        ("e", 1, "", "not comparable"),
+        ("f", 2, "x", "does not hold"),
+        ("f", 2, "y", "holds"),
+        ("g", 3, "w", "holds"),
+        ("g", 3, "x", "does not hold"),
+        ("g", 3, "y", "does not hold"),
+        ("g", 3, "z", "does not hold"),
+    ]
+    claims = pd.DataFrame(rows, columns=["id", "case", "quantity", "verdict"]).assign(section="5.1")
+    claims["statement"] = "the claim " + claims["id"]
+    assert scorecard.verdicts_of_claims(claims) == {
+        "holds": ["The claim a (5.1)"],
+        "holds in part": [
+            "The claim b (5.1): not for Case Study II",
+            "The claim f (5.1): not for Case Study II (x)",
+            "The claim g (5.1): not for Case Study III (3 of 4 quantities)",
+        ],
+        "does not hold": ["The claim c (5.1)"],
+        "cannot tell": ["The claim d (5.1)"],
+        "not comparable": ["The claim e (5.1)"],
+    }

@@ -1,0 +1,268 @@
+"""The tables of the report and Markdown, against cases built by hand and the paper's own numbers."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from helpers.report import tables
+from helpers.settings.paper import load, load_published
+
+PARAMS = Path(__file__).resolve().parents[2] / "params"
+FEATURES = ["C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III"]
+TWO = ["h-I", "h-II"]
+NUMBERS = ["reproduced", "ci_low", "ci_high", "pred_low", "pred_high"]
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("T", "$T^*$"),
+        ("C_A", "$C_A^*$"),
+        ("C_A0", "$C_{A0}^*$"),
+        ("T_E", "$T_E^*$"),
+        ("level_tank_2", r"$\mathrm{level}_{tank,2}^*$"),
+    ],
+)
+def test_symbols(name: str, expected: str) -> None:
+    assert tables.symbol(name) == expected
+
+
+def test_feature_symbols() -> None:
+    assert [tables.feature_symbol(name) for name in ("C_A-I", "T-III")] == ["$C_A^*$-I", "$T^*$-III"]
+
+
+def test_table_1_holds_the_conditions_of_the_paper() -> None:
+    params = {case: load(PARAMS, case) for case in (1, 2, 3)}
+    table = tables.table_1({case: entry.case for case, entry in params.items()}, params[1].process)
+    assert list(table.columns) == [
+        "case_study",
+        "system_parameter",
+        "Concentration of reagent (C_A) control loop",
+        "Reactor temperature (T) control loop",
+    ]
+    start = ["initial state distribution", "N(0, 0.25)", "N(0, 0.75)"]
+    assert table.to_numpy().tolist() == [
+        ["I", *start],
+        ["I", "set point", "-1", "4"],
+        ["II", *start],
+        ["II", "set point", "1", "4"],
+        ["III", *start],
+        ["III", "set point", "-2.5", "3"],
+    ]
+    assert "Concentration of reagent ($C_A^*$) control loop" in tables.to_markdown(table)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "style", "text"),
+    [
+        ((16.84, 16.5, 17.01), {}, "16.8 [16.5, 17.0]"),
+        ((0.0123, 0.0098, 0.0151), {}, "0.0123 [0.0098, 0.0151]"),
+        ((-0.8, -1.26, 0.04), {}, "-0.80 [-1.26, 0.04]"),
+        ((0.812, 0.7, 0.95), {"decimals": 1, "unit": " %"}, "0.8 % [0.7, 0.9]"),
+        ((1957.4, 1954.2, 1958.6), {}, "1957 [1954, 1959]"),
+        ((16.84, np.nan, np.nan), {}, "16.8"),  # too few seeds
+        ((300.0, 300.0, 300.0), {"decimals": 0}, "300"),  # no spread
+        ((0.0, 0.0, 0.0), {}, "0"),
+        ((np.nan, np.nan, np.nan), {}, "–"),
+    ],
+)
+def test_spread(numbers: tuple[float, float, float], style: dict, text: str) -> None:
+    assert tables.spread(dict(zip(("median", "ci_low", "ci_high"), numbers, strict=True)), **style) == text
+
+
+def compared(**changes: object) -> pd.DataFrame:
+    """A comparison of two features, in its columns; alpha of one seed."""
+    rows = []
+    for row, ours in (("expert", 10.0), ("policy", 11.0), ("alpha", 0.61)):
+        for shift, feature in enumerate(TWO):
+            numbers = {"published": ours + shift + 0.5, "reproduced": ours + shift, "ci_low": ours - 1, "ci_high": ours + 1}
+            numbers |= {"pred_low": ours - 2, "pred_high": ours + 2}
+            rows.append({"row": row, "feature": feature, **numbers, "verdict": "match", **changes})
+    return pd.DataFrame(rows)
+
+
+def test_results_table_sets_printed_and_own_numbers_together() -> None:
+    table = tables.results_table(compared(), TWO)
+    assert list(table.columns) == ["quantity", "source", "h-I", "h-II"]
+    assert table.to_numpy()[:5].tolist() == [
+        ["E[v^E]", "published", "10.50", "11.50"],
+        ["E[v^E]", "reproduced", "10.00", "11.00"],
+        ["E[v^E]", "interval of median", "9.00 to 11.00", "9.00 to 11.00"],
+        ["E[v^E]", "interval of one run", "8.00 to 12.00", "8.00 to 12.00"],
+        ["E[v^E]", "verdict", "match", "match"],
+    ]
+    assert table["quantity"].unique().tolist() == ["E[v^E]", "E[v^pi]", "alpha*"]
+    assert table.iloc[11].tolist() == ["alpha*", "reproduced", "0.610", "1.610"]
+    with pytest.raises(KeyError):
+        tables.results_table(compared(), ["h-I", "h-III"])
+
+
+def test_results_table_of_one_seed_has_no_intervals() -> None:
+    table = tables.results_table(compared(ci_low=np.nan, ci_high=np.nan, pred_low=np.nan, pred_high=np.nan), TWO)
+    assert table["source"].tolist() == ["published", "reproduced", "verdict"] * 3
+
+
+def medians(rows: list[tuple[int, str, str, float]]) -> pd.DataFrame:
+    """A summary whose intervals reach a tenth to either side."""
+    frame = pd.DataFrame(rows, columns=["case", "stage", "metric", "median"])
+    return frame.assign(n_seeds=7, ci_low=0.9 * frame["median"], ci_high=1.1 * frame["median"], greatest=2 * frame["median"])
+
+
+def test_quality_table_has_a_row_for_each_figure_of_merit_and_a_column_for_each_controller() -> None:
+    rows = [
+        (1, "expert_paired", "objective_x", 10.0),
+        (1, "online", "objective_x", 18.0),
+        (1, "online", "share", 0.9),
+        (1, "online", "overshoot:T", 0.02),
+        (1, "online", "movement:T_E", 321.0),
+        (1, "online", "episodes", 2000.0),
+    ]
+    table = tables.quality_table(medians(rows), load(PARAMS, 1).process).set_index("figure of merit")
+    assert list(table) == ["PID", "offline policy", "online policy", "online policy, learned on y", "minimum variance on y"]
+    assert table.loc["$J$ on $x$"].tolist() == ["10.00 [9.00, 11.00]", "–", "18.00 [16.20, 19.80]", "–", "–"]
+    assert table.loc["$J$ on $x$, % of minimum variance", "online policy"] == "90.0 [81.0, 99.0]"
+    assert table.loc["overshoot $T^*$, %", "online policy"] == "2.0 [1.8, 2.2]"
+    assert table.loc["movement $T_E^*$", "online policy"] == "321 [289, 353]"
+    assert table.loc["episodes spent", "online policy"] == "2000 [1800, 2200]"
+    assert len(table) == 3 + 2 * 3 + 2 + 1
+
+
+def test_variants_table_has_gap_interval_worst_seed_and_cost() -> None:
+    cost = (("epochs", 300.0), ("chosen_epoch", 250.0), ("episodes", 150000.0), ("gradient_steps", 600.0))
+    stages = ((2, "offline_printed", 0.2), (1, "offline", 0.01), (1, "online", 0.5))
+    table = tables.variants_table(
+        medians([(case, stage, metric, value) for case, stage, gap in stages for metric, value in (("feature_gap", gap), *cost)])
+    )
+    assert table.to_numpy().tolist() == [
+        [1, "improved", 7, "1.0 [0.9, 1.1]", "2.0", 300, 250, 150000, 600],
+        [2, "printed", 7, "20.0 [18.0, 22.0]", "40.0", 300, 250, 150000, 600],
+    ]
+
+
+def test_trials_table_has_a_row_for_each_trial() -> None:
+    runs = [("base", 1, 0, 0.02), ("base", 1, 1, 0.03), ("base", 1, 2, 0.10), ("base", 3, 0, 0.04), ("wild", 3, 0, 0.5)]
+    trials = pd.DataFrame(runs, columns=["trial", "case", "seed", "gap"]).assign(family="weights")
+    trials["description"] = "what " + trials["trial"]
+    assert tables.trials_table(trials).to_dict("records") == [
+        {
+            "family": "weights",
+            "trial": "base",
+            "description": "what base",
+            "case I, %": "3.0 (2.0 to 10.0; 3 seeds)",
+            "case III, %": "4.0 (4.0 to 4.0; 1 seed)",
+        },
+        {
+            "family": "weights",
+            "trial": "wild",
+            "description": "what wild",
+            "case I, %": "–",
+            "case III, %": "50.0 (50.0 to 50.0; 1 seed)",
+        },
+    ]
+
+
+def test_claims_table_names_section_and_statement_once() -> None:
+    numbers = {"n": 20, "median": -1.5, "ci_low": -1.75, "ci_high": -1.25, "test": "difference below 0", "reason": "r"}
+    words = {"section": "5.1", "statement": "s", "quantity": "q", "verdict": "holds"}
+    claims = pd.DataFrame([{"id": name, "case": case, **words, **numbers} for name, case in (("a", 1), ("a", 3), ("b", 2))])
+    claims.loc[2, ["median", "ci_low", "ci_high"]] = np.nan
+    table = tables.claims_table(claims)
+    assert table["statement"].tolist() == ["s", "", "s"]
+    assert table["case"].tolist() == ["I", "III", "II"]
+    assert table["median"].tolist() == ["-1.50 [-1.75, -1.25]", "-1.50 [-1.75, -1.25]", "–"]
+    assert list(table) == ["section", "statement", "case", "quantity", "median", "seeds", "test", "verdict", "reason"]
+
+
+def test_parameters_table_lists_each_parameter_once_and_readably() -> None:
+    leaves = [leaf for case in (1, 2) for leaf in load(PARAMS, case).leaves]
+    table = tables.parameters_table(leaves)
+    assert list(table.columns) == ["file", "key", "value", "unit", "source", "status"]
+    assert not table.duplicated(["file", "key"]).any()
+    value = table.set_index(["file", "key"])["value"]
+    assert value["process.yaml", "drift_input"] == "[[0.5, 0], [0, 0.305]]"
+    assert value["process.yaml", "controlled"] == "[C_A, T]"
+    assert value["case_1.yaml", "set_point"] == "[-1, 4]"
+    assert value["case_2.yaml", "set_point"] == "[1, 4]"
+    assert value["learning.yaml", "variants.improved.weights.keep_nearest"] == "yes"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(True, "yes"), (False, "no"), (0.0001, "0.0001"), (300, "300"), ("x", "x"), ([1.0, [-2.5]], "[1, [-2.5]]")]
+)
+def test_render(value: object, text: str) -> None:
+    assert tables.render(value) == text
+
+
+def cells(markdown: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in markdown.splitlines()]
+
+
+def test_markdown_numbers() -> None:
+    frame = pd.DataFrame({"v": [21.23456, -0.0671234, 20000.4, np.nan, -1e-9, 0.0], "n_seeds": [1, 20, 300, 4000, 50000, 1234567]})
+    shown = cells(tables.to_markdown(frame))
+    assert shown[0] == ["V", "N seeds"]
+    assert shown[1][0].endswith("-:")
+    assert shown[1][1].endswith("-:")
+    assert [row[0] for row in shown[2:]] == ["21.23", "-0.06712", "20000", "–", "-1e-09", "0"]
+    assert [row[1] for row in shown[2:]] == ["1", "20", "300", "4000", "50000", "1234567"]
+    assert [row[0] for row in cells(tables.to_markdown(frame, digits=2))[2:]] == ["21", "-0.067", "20000", "–", "-1e-09", "0"]
+
+
+def test_columns_of_numbers_and_intervals_stand_to_the_right() -> None:
+    frame = pd.DataFrame(
+        {
+            "number": [1.5, np.nan],
+            "interval": ["0.8 [0.7, 0.9]", "–"],
+            "range": ["3.0 (2.0 to 10.0; 3 seeds)", "1 %"],
+            "text": ["match", "2"],
+            "flag": [True, False],
+        }
+    )
+    rule = cells(tables.to_markdown(frame))[1]
+    assert [cell.endswith(":") for cell in rule] == [True, True, True, False, False]
+
+
+def printed(case: int) -> pd.DataFrame:
+    """A comparison that reproduces the paper's rows themselves."""
+    rows = [
+        {"row": row, "feature": name, "published": value, "verdict": "match", **dict.fromkeys(NUMBERS, value)}
+        for row in ("expert", "policy", "alpha")
+        for name, value in zip(FEATURES, getattr(load_published(PARAMS)[case], row), strict=True)
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_the_printed_rows_come_out_as_printed() -> None:
+    shown = cells(tables.to_markdown(tables.results_table(printed(1), FEATURES)))
+    assert shown[2][2:] == ["21.63", "20.68", "4.08", "7.93", "-22.87", "-22.43"]
+    assert shown[12][2:] == ["0.137", "0.652", "-0.067", "-0.630", "-0.194", "-0.343"]
+
+
+def test_markdown_text_is_typeset_or_escaped() -> None:
+    frame = pd.DataFrame({"C_A-I": ["alpha*", None, "|e| before", "T-II", "a * b <c> $x|y$", "x = 2"], "flag": [True, False] * 3})
+    lines = tables.to_markdown(frame, labels={"flag": "Is it so?"}).splitlines()
+    assert lines[0].startswith("| $C_A^*$-I")
+    assert "Is it so?" in lines[0]
+    for line, expected in zip(
+        lines[2:], (r"$\alpha^*$", "–", r"\|e\| before", "$T^*$-II", r"a \* b \<c> $x|y$", "x = 2"), strict=True
+    ):
+        assert line.startswith(f"| {expected} ")
+    assert [row[-1] for row in cells("\n".join(lines[2:]))] == ["yes", "no"] * 3
+
+
+def test_markdown_becomes_a_table_with_maths_in_html() -> None:
+    pypandoc = pytest.importorskip("pypandoc")
+    rows = printed(1)
+    rows.loc[rows["feature"] == "T-I", "reproduced"] = np.nan
+    table = tables.results_table(rows, FEATURES)
+    html = pypandoc.convert_text(tables.to_markdown(table), "html", format="markdown", extra_args=["--mathml"])
+    assert html.count("<tr") == 16
+    assert html.count("<math") == 6 + 15
+    assert "–" in html
+    assert "-0.067" in html.replace("−", "-")
+
+
+def test_an_empty_table_is_a_header() -> None:
+    assert tables.to_markdown(pd.DataFrame({"file": [], "key": []})).startswith("| File")

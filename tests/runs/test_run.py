@@ -1,0 +1,445 @@
+"""One stage = one notebook: the command line, plain papermill, and the order of the stages in the Snakefile."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+from collections import Counter
+from pathlib import Path
+
+import nbformat
+import pytest
+
+from helpers.runs import identity, run
+from helpers.runs.artifacts import load_stage
+from helpers.runs.sources import PROJECT
+
+SLOW = pytest.mark.torture
+PAPERMILL = [sys.executable, "-m", "papermill", "--no-progress-bar"]
+
+
+def text_of(path):
+    """All the text of an executed notebook, in which its pictures would only match by accident."""
+    return re.sub(r'"image/png": "[^"]*"', "", Path(path).read_text(encoding="utf-8"))
+
+
+def everything_below(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+@pytest.fixture
+def here(monkeypatch, tmp_path):
+    """A working directory that is not the project's, in which `run.main` may not leave its setting behind."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TQDM_DISABLE", "1")
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    return tmp_path
+
+
+@pytest.fixture
+def toy(monkeypatch, here):
+    """Notebooks of one cell, in a folder that stands for the project's."""
+
+    def write(code):
+        cell = nbformat.v4.new_code_cell("case = 1", metadata={"tags": ["parameters"]})
+        (here / "notebooks").mkdir(exist_ok=True)
+        nbformat.write(
+            nbformat.v4.new_notebook(cells=[cell, nbformat.v4.new_code_cell(code)]), here / "notebooks/02_offline_irl.ipynb"
+        )
+        monkeypatch.setattr(run, "NOTEBOOKS", here / "notebooks")
+
+    return write
+
+
+def test_a_warning_in_an_executed_copy_names_no_folder_of_the_machine(tmp_path):
+    path = tmp_path / "copy.ipynb"
+    text = f"{sysconfig.get_path('purelib')}/package/file.py:1: UserWarning: {PROJECT}/src/helpers/runs/run.py\n"
+    cell = nbformat.v4.new_code_cell("warn()", outputs=[nbformat.v4.new_output("stream", name="stderr", text=text)])
+    nbformat.write(nbformat.v4.new_notebook(cells=[cell]), path)
+    run.strip_machine(path)
+    said = nbformat.read(path, as_version=4).cells[0].outputs[0].text
+    assert said == "package/file.py:1: UserWarning: src/helpers/runs/run.py\n"
+
+
+def test_a_notebook_runs_from_any_directory_and_leaves_no_trace_of_the_machine(here, capfd):
+    arguments = [
+        "01_demonstrations",
+        "copies/01.ipynb",
+        "-p",
+        "case",
+        "2",
+        "-p",
+        "seed",
+        "5",
+        "-p",
+        "output_root",
+        str(here / "out"),
+    ]
+    assert run.main(arguments) == 0
+    assert capfd.readouterr().out.strip() == "done: 01_demonstrations case=2 seed=5"
+    stage = load_stage(here / "out/smoke/seed_5/case_2/demonstrations", "notebook 01")
+    assert {"notebook": "01_demonstrations", "case": 2, "seed": 5, "scale": "smoke"}.items() <= stage.record.items()
+    assert everything_below(here / "copies") == ["01.ipynb"]
+    copy = nbformat.read(here / "copies/01.ipynb", as_version=4)
+    assert "papermill" not in copy.metadata
+    for cell in copy.cells:
+        assert not {"papermill", "execution"} & set(cell.metadata)
+        assert cell.cell_type == "markdown" or cell.execution_count
+    for place in (here, PROJECT, Path.home(), "ipykernel"):
+        assert f"{place}/" not in text_of(here / "copies/01.ipynb")
+
+
+WRONG_ARGUMENTS = {
+    "a misspelt parameter": (["01_demonstrations", "-p", "case", "1", "-p", "sed", "3"], "'sed'"),
+    "an unknown case": (["01_demonstrations", "-p", "case", "9"], "case_9.yaml"),
+    "text for a seed": (["01_demonstrations", "-p", "seed", "five"], "'seed'"),
+    "a strange digit": (["01_demonstrations", "-p", "seed", "²"], "'seed'"),
+    "an unknown scale": (["02_offline_irl", "-p", "scale", "huge"], "'huge'"),
+    "an unknown notebook": (["06_oracle"], "06_oracle.ipynb"),
+    "a notebook elsewhere": (["../notebooks/01_demonstrations"], "there is no such notebook"),
+    "results among the code": (["01_demonstrations", "-p", "output_root", str(PROJECT / "results/../src")], "'output_root'"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "says"), WRONG_ARGUMENTS.values(), ids=WRONG_ARGUMENTS)
+def test_wrong_arguments_end_at_once_with_nothing_run_and_nothing_written(monkeypatch, here, capfd, arguments, says):
+    monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, **__: pytest.fail("the notebook was run"))
+    notebook, *parameters = arguments
+    assert run.main([notebook, "copies/x.ipynb", "-p", "output_root", str(here / "out"), *parameters]) == 2
+    said = capfd.readouterr().err
+    assert said.startswith("error: ")
+    assert said.count("\n") == 1
+    assert says in said
+    assert everything_below(here) == []
+
+
+@pytest.mark.parametrize(
+    "output", ["src/helpers/run.ipynb", "notebooks/01_demonstrations.ipynb", "results/../README.md", "x.ipynb"]
+)
+def test_no_executed_copy_is_written_over_what_the_project_is_made_of(monkeypatch, here, capfd, output):
+    monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, **__: pytest.fail("the notebook was run"))
+    (here / "link").symlink_to(PROJECT)
+    for place in (PROJECT / output, here / "link" / output):
+        assert run.main(["01_demonstrations", str(place), "-p", "output_root", str(here / "out")]) == 2
+        assert "'output'" in capfd.readouterr().err
+    assert everything_below(here) == ["link"]
+
+
+@pytest.mark.parametrize("folder", ["template", "reference", "latest/../template/deep"])
+def test_no_run_writes_over_the_committed_part_of_the_reports(monkeypatch, here, capfd, folder):
+    monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, **__: pytest.fail("the notebook was run"))
+    (here / "link").symlink_to(PROJECT)
+    before = [everything_below(PROJECT / part) for part in run.COMMITTED]
+    for project in (PROJECT, here / "link"):
+        place = str(project / "reports" / folder)
+        for name, arguments in (("output", [f"{place}/report.css"]), ("output_root", ["x.ipynb", "-p", "output_root", place])):
+            assert run.main(["05_report", *arguments]) == 2
+            said = capfd.readouterr().err
+            assert said.startswith(f"error: parameter '{name}': no run writes into reports/template/ and reports/reference/")
+            assert said.count("\n") == 1
+    assert [everything_below(PROJECT / part) for part in run.COMMITTED] == before
+    assert everything_below(here) == ["link"]
+
+
+def test_roots_are_those_of_the_callers_directory(monkeypatch, here):
+    """The kernel works elsewhere; a folder may also be named like a number."""
+    handed = {}
+    monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, parameters, **__: handed.update(parameters))
+    shutil.copytree(PROJECT / "params", here / "2024")
+    roots = [["params_root", "2024"], ["output_root", "out"], ["input_root", str(here / "in")]]
+    assert run.main(["01_demonstrations", "x.ipynb", *(word for root in roots for word in ("-p", *root))]) == 0
+    assert handed == {name: str(here / Path(folder).name) for name, folder in roots}
+
+
+def test_a_damaged_parameter_file_is_marked_for_the_summary_and_the_older_copy_stays(monkeypatch, here, capfd):
+    monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, **__: None)
+    params = shutil.copytree(PROJECT / "params", here / "params") / "process.yaml"
+    good = params.read_text(encoding="utf-8")
+    params.write_text("extra: 1\n" + good, encoding="utf-8")
+    (here / "01.ipynb").write_text("an older run")
+    arguments = ["01_demonstrations", "01.ipynb", "-p", "case", "2", "-p", "params_root", "params"]
+    assert run.main(arguments) == 2
+    said = capfd.readouterr().err
+    assert said.startswith(f"error: 01_demonstrations case=2: {params}: ")
+    assert said == f"error: {(here / '01.failed').read_text()}"
+    assert (here / "01.ipynb").read_text() == "an older run"
+    params.write_text(good, encoding="utf-8")
+    assert run.main(arguments) == 0
+    assert not (here / "01.failed").exists()
+
+
+@pytest.mark.torture
+def test_a_missing_result_ends_in_a_sentence_and_keeps_the_executed_copy(here, capfd):
+    arguments = [
+        "02_offline_irl",
+        "copies/02.ipynb",
+        "-p",
+        "input_root",
+        str(here / "nothing"),
+        "-p",
+        "output_root",
+        str(here / "out"),
+    ]
+    assert run.main(arguments) == 1
+    said = capfd.readouterr().err.strip()
+    missing = here / "nothing/smoke/seed_0/case_1/demonstrations/record.json"
+    sentence = f"ArtifactError: {missing}: this result is missing; run 01_demonstrations for case 1 first"
+    assert said.splitlines()[-1] == f"error: 02_offline_irl: {sentence} (executed copy with the traceback: copies/02.ipynb)"
+    assert everything_below(here) == ["copies", "copies/02.failed", "copies/02.ipynb"]
+    assert f"error: {(here / 'copies/02.failed').read_text().strip()}" == said.splitlines()[-1]
+    outputs = [output for cell in nbformat.read("copies/02.ipynb", 4).cells for output in cell.get("outputs", [])]
+    (error,) = [output for output in outputs if output.output_type == "error"]
+    assert "\n".join(error.traceback) == sentence
+
+
+def test_a_notebook_that_raises_keeps_its_traceback_in_place_of_an_older_copy(here, toy, capfd):
+    toy("good = 1\nbad = good / 0")
+    (here / "02.ipynb").write_text("an older run")
+    assert run.main(["02_offline_irl", "02.ipynb"]) == 1
+    assert "error: 02_offline_irl: ZeroDivisionError: division by zero (executed copy" in capfd.readouterr().err
+    (error,) = [output for cell in nbformat.read("02.ipynb", 4).cells for output in cell.get("outputs", [])]
+    traceback = re.sub(r"\x1b\[[\d;]*m", "", "\n".join(error.traceback))
+    assert "----> 2 bad = good / 0" in traceback
+    assert everything_below(here) == ["02.failed", "02.ipynb", "notebooks", "notebooks/02_offline_irl.ipynb"]
+    toy("good = 1")
+    assert run.main(["02_offline_irl", "02.ipynb"]) == 0
+    assert everything_below(here) == ["02.ipynb", "notebooks", "notebooks/02_offline_irl.ipynb"]
+
+
+def test_a_kernel_that_dies_is_told(here, toy, capfd):
+    toy("import os\nos._exit(1)")
+    assert run.main(["02_offline_irl", "02.ipynb"]) == 1
+    assert "error: 02_offline_irl: the kernel died" in capfd.readouterr().err
+
+
+@pytest.mark.torture
+def test_plain_papermill_refuses_a_misspelt_parameter(here):
+    """papermill itself only warns; the notebook's first cell ends the run."""
+    notebook = PROJECT / "notebooks/01_demonstrations.ipynb"
+    command = [*PAPERMILL, notebook, "01.ipynb", "-p", "case", "1", "-p", "sed", "3", "-p", "output_root", str(here / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "notebooks/01_demonstrations.ipynb: there is no parameter 'sed'; the parameters are case, seed" in done.stderr
+    assert everything_below(here) == ["01.ipynb"]
+
+
+# The order of the stages ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def source(tmp_path):
+    """A copy of what results are made from and of what plans them, to be changed."""
+    copy = tmp_path / "copy"
+    for part in ("params", "profiles", "src/helpers", "reports/template"):
+        shutil.copytree(PROJECT / part, copy / part, ignore=shutil.ignore_patterns("__pycache__"))
+    (copy / "notebooks").mkdir()
+    for path in (PROJECT / "Snakefile", *(PROJECT / "notebooks").glob("*.ipynb")):
+        shutil.copy(path, copy / path.relative_to(PROJECT))
+    return copy
+
+
+@pytest.fixture
+def plan(source):
+    """The jobs that the Snakefile would run in that copy, by rule."""
+
+    def dry_run(*targets, **config):
+        settings = [f"{name}={value}" for name, value in ({"scale": "smoke", "reports": "report"} | config).items()]
+        snakemake = [sys.executable, "-m", "snakemake", "-n", "--profile", "profiles/local", "--cores", "1", "--nolock"]
+        done = subprocess.run(
+            [*snakemake, "--config", *settings, "--", *targets], cwd=source, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        counts = dict(re.findall(r"^(\w+) +(\d+)$", (done.stdout + done.stderr), re.MULTILINE))
+        return {rule: int(count) for rule, count in counts.items() if rule not in ("all", "total")}
+
+    dry_run.folder = source
+    return dry_run
+
+
+@pytest.fixture
+def finished(plan):
+    """The same after a finished run, whose results were made from what the copy holds."""
+    copy = plan.folder
+    shutil.copytree(PROJECT / "notebooks/inputs", copy / "results")
+    (copy / "report").mkdir()
+    for path in (copy / "results").rglob("record.json"):
+        record = json.loads(path.read_text(encoding="utf-8"))
+        run = [record[name] for name in ("notebook", "scale", "case", "variant")]
+        record["inputs"] = identity.inputs(run[0], copy / "params", *run[1:], copy)
+        path.write_text(json.dumps(record), encoding="utf-8")
+    made_from = identity.inputs("05_report", copy / "params", "smoke", project=copy)
+    (copy / "report/provenance.json").write_text(json.dumps({"inputs": made_from}), encoding="utf-8")
+    (copy / "report/report.html").touch()
+    # As stages finish one after the other, then the report.
+    order = {"record.json": 2000, "report.html": 3000, "provenance.json": 3000}
+    stages = ["demonstrations", "offline", "transfer", "online"]
+    for path in copy.rglob("*"):
+        after = next((number for number, stage in enumerate(stages) if path.parent.name.startswith(stage)), 0)
+        time = order.get(path.name, 1000) + after
+        os.utime(path, (time, time))
+    return plan
+
+
+ONE_SEED = {"demonstrations": 3, "offline": 5, "online": 2, "transfer": 1, "transfer_alone": 1, "report": 1}
+ONLINE = {rule: count for rule, count in ONE_SEED.items() if rule not in ("demonstrations", "offline")}
+STAGE = "results/smoke/seed_0/case_{}/{}/record.json"
+
+
+def test_the_whole_run_is_fourteen_jobs_with_all_and_each_seed_repeats_its_stages(plan):
+    assert plan() == ONE_SEED
+    assert sum(ONE_SEED.values()) + 1 == 14
+    assert plan(seeds=2) == {rule: count if rule == "report" else 2 * count for rule, count in ONE_SEED.items()}
+
+
+@pytest.mark.parametrize(
+    ("target", "jobs"),
+    [
+        (STAGE.format(3, "transfer_printed"), {"demonstrations": 2, "offline": 1, "transfer_alone": 1}),
+        pytest.param(STAGE.format(2, "demonstrations"), {"demonstrations": 1}, marks=SLOW),
+        pytest.param(STAGE.format(2, "online_improved"), {"demonstrations": 1, "offline": 1, "online": 1}, marks=SLOW),
+        pytest.param(STAGE.format(3, "online_improved"), {"demonstrations": 2, "offline": 1, "transfer": 1}, marks=SLOW),
+    ],
+    ids=["transfer alone", "recording", "online", "transfer"],
+)
+def test_a_stage_asked_for_alone_runs_only_what_it_needs(plan, target, jobs):
+    assert plan(target) == jobs
+
+
+@pytest.mark.torture
+def test_finished_stages_are_skipped(finished):
+    assert finished() == {}
+    for path in (STAGE.format(2, "online_improved"), "report/report.html"):
+        (finished.folder / path).unlink()
+    assert finished() == {"online": 1, "report": 1}
+
+
+# What is made from what ------------------------------------------------------------------------------------------------
+
+RESULTS = {  # by rule of the Snakefile: the notebook, case and variant of each of its results
+    "demonstrations": [("01_demonstrations", case, "improved") for case in (1, 2, 3)],
+    "offline": [("02_offline_irl", case, variant) for case in (1, 2) for variant in ("improved", "printed")]
+    + [("02_offline_irl", 3, "improved")],
+    "online": [("03_online_improvement", case, "improved") for case in (1, 2)],
+    "transfer": [("04_knowledge_transfer", 3, "improved")],
+    "transfer_alone": [("04_knowledge_transfer", 3, "printed")],
+    "report": [("05_report", None, "improved")],
+}
+EVERYTHING = {rule: len(results) for rule, results in RESULTS.items()}
+LEARNT = {rule: number for rule, number in EVERYTHING.items() if rule != "report"}
+ADDED = None  # in place of words to replace: a line at the end
+
+
+def edited(text, old, new):
+    """The text with one change."""
+    if old is ADDED:
+        return text + new
+    assert old in text
+    return text.replace(old, new, 1)
+
+
+EDITS = [
+    ("params/case_2.yaml", "250", "249", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
+    ("params/learning.yaml", "std_high: {value: 0.25", "std_high: {value: 0.3", ONLINE),
+    ("params/learning.yaml", "episodes: {value: 400", "episodes: {value: 300", {"report": 1}),  # of another scale
+    ("params/published.yaml", "21.63", "21.64", {"report": 1}),
+    ("notebooks/04_knowledge_transfer.ipynb", "carried = ", "taken = ", {"transfer": 1, "transfer_alone": 1}),
+    ("src/helpers/learning/maxent_irl.py", ADDED, "# a comment\n", {}),
+    ("src/helpers/learning/maxent_irl.py", '"""Algorithm 2', '"""The algorithm 2', {}),  # a docstring
+    ("src/helpers/report/tables.py", "def ", "def _(): ...\n\n\ndef ", {"report": 1}),
+    ("reports/template/report.md.jinja", "# In one page", "# In a page", {}),  # Snakemake looks at it by itself
+    ("src/helpers/learning/maxent_irl.py", "return project(self.mean)", "return project(self.mean.clone())", LEARNT),
+    ("src/helpers/report/report.py", "RUNNERS = (", "RUNNERS = (*(),", {"report": 1}),
+    ("src/helpers/report/figures.py", "MUTED = ", "MUTED: str = ", {"report": 1}),
+]
+
+
+def test_a_change_makes_exactly_the_results_stale_that_are_made_from_it(source):
+    def made_from():
+        results = [(rule, *run) for rule, runs in RESULTS.items() for run in runs]
+        return {(rule, *run): identity.inputs(run[0], source / "params", "smoke", *run[1:], source) for rule, *run in results}
+
+    before = made_from()
+    for changed, old, new, stale in EDITS:
+        path = source / changed
+        text = path.read_text(encoding="utf-8")
+        path.write_text(edited(text, old, new), encoding="utf-8")
+        after = made_from()
+        assert Counter(result[0] for result in before if after[result] != before[result]) == stale, (changed, new)
+        path.write_text(text, encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("changed", "old", "new", "jobs"),
+    [
+        ("params/case_2.yaml", "250", "249", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
+        pytest.param("src/helpers/learning/maxent_irl.py", ADDED, "# a comment\n", {}, marks=SLOW),
+        pytest.param("src/helpers/learning/maxent_irl.py", "(self.mean)", "(+self.mean)", ONE_SEED, marks=SLOW),
+        pytest.param("reports/template/report.md.jinja", "# In one page", "# In a page", {"report": 1}, marks=SLOW),
+    ],
+)
+def test_what_is_stale_is_run_again_with_all_that_read_it(finished, changed, old, new, jobs):
+    path = finished.folder / changed
+    before = path.read_text(encoding="utf-8")
+    path.write_text(edited(before, old, new), encoding="utf-8")
+    assert finished() == jobs
+    path.write_text(before, encoding="utf-8")
+    assert finished() == {}  # whatever the times of the files
+
+
+@pytest.mark.torture
+def test_results_that_were_removed_are_made_again_whatever_else_has_changed(finished):
+    shutil.rmtree(finished.folder / "results")
+    path = finished.folder / "src/helpers/report/report.py"
+    path.write_text(path.read_text(encoding="utf-8").replace("RUNNERS = (", "RUNNERS = (*(),", 1), encoding="utf-8")
+    assert finished() == ONE_SEED
+
+
+@pytest.mark.torture
+@pytest.mark.parametrize("name", ["summary.md", "machine.md", "scaling.svg"])
+def test_what_make_bench_wrote_last_goes_into_the_report(finished, name):
+    folder = finished.folder / "reports/reference/benchmarks"
+    folder.mkdir(parents=True)
+    (folder / name).touch()
+    assert finished() == {"report": 1}
+    os.utime(folder / name, (1000, 1000))
+    assert finished() == {}
+
+
+@pytest.mark.torture
+@pytest.mark.parametrize(
+    ("scale", "says"),
+    [
+        ("smoke", "\n1 notebook(s) failed; "),
+        pytest.param("huge", "\nNo notebook failed, what went wrong stands above; ", marks=SLOW),
+    ],
+    ids=["a parameter file", "the command"],
+)
+def test_the_summary_tells_what_was_refused_before_it_ran(plan, scale, says):
+    path = plan.folder / "params/case_2.yaml"
+    if scale == "smoke":
+        path.write_text(path.read_text(encoding="utf-8") + "extra: 1\n", encoding="utf-8")
+    command = [sys.executable, "-m", "snakemake", "--profile", "profiles/local", "--cores", "1", "--config", f"scale={scale}"]
+    target = f"results/{scale}/seed_0/case_2/demonstrations/record.json"
+    environment = {**os.environ, "PYTHONPATH": str(plan.folder / "src")}
+    done = subprocess.run([*command, "--", target], cwd=plan.folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert says in done.stderr
+    said = done.stderr[done.stderr.index(says) :]
+    assert ("case_2.yaml: " in said) is (scale == "smoke")
+
+
+@pytest.mark.torture
+def test_a_damaged_record_is_made_again(finished):
+    (finished.folder / STAGE.format(2, "online_improved")).write_text("{")
+    assert finished() == {"online": 1, "report": 1}
+
+
+@pytest.mark.torture
+def test_a_report_of_the_seeds_that_are_whole_is_made_only_when_asked(finished):
+    (finished.folder / STAGE.format(2, "online_improved")).unlink()
+    (finished.folder / "report/report.html").unlink()
+    assert finished(missing=1) == {"report": 1}
+    assert finished() == {"online": 1, "report": 1}

@@ -1,0 +1,195 @@
+"""What a notebook knows of its run: wrong parameters end in one sentence; defaults hold from any working directory."""
+
+import json
+import shutil
+
+import pandas as pd
+import pytest
+import torch
+
+from helpers.runs.artifacts import save_stage
+from helpers.runs.request import NOTEBOOK_PARAMETERS, SessionError, check_parameters
+from helpers.runs.session import open_report, open_session, parameters_hash
+from helpers.runs.sources import PROJECT
+from helpers.settings.leaf import ParameterError
+
+NOTEBOOKS = sorted(path.stem for path in (PROJECT / "notebooks").glob("[0-9]*.ipynb"))
+OFFLINE, REPORT = "02_offline_irl", "05_report"
+OF_ALL_CASES = {REPORT: ("seeds",), "00_inferred_settings": ("seed",), "07_your_own_process": ("seed",)}
+
+
+def defaults(notebook):
+    """The variables that a notebook's parameters cell defines."""
+    cells = json.loads((PROJECT / f"notebooks/{notebook}.ipynb").read_text(encoding="utf-8"))["cells"]
+    (cell,) = [cell for cell in cells if "parameters" in cell["metadata"].get("tags", [])]
+    namespace = {}
+    exec("".join(cell["source"]), {}, namespace)
+    return namespace
+
+
+def globals_of_a_kernel(notebook, **given):
+    """A notebook's globals after its parameters cell, with what IPython and papermill add."""
+    return {"__name__": "__main__", "In": [""], "Out": {}, "_": "", "_i1": "case = 1", "quit": exit, **defaults(notebook), **given}
+
+
+def refusal(action, *arguments):
+    with pytest.raises((SessionError, ParameterError)) as caught:
+        action(*arguments)
+    sentence = str(caught.value)
+    assert "\n" not in sentence
+    assert caught.value._render_traceback_() == [f"{type(caught.value).__name__}: {sentence}"]  # what IPython shows
+    return sentence
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS)
+def test_the_parameters_cell_names_known_parameters_of_the_right_type(notebook):
+    found = defaults(notebook)
+    assert set(found) <= set(NOTEBOOK_PARAMETERS)
+    assert {"scale", "input_root", "output_root", "params_root"} <= set(found)
+    assert set(OF_ALL_CASES.get(notebook, ("case", "seed"))) == {"case", "seed", "seeds"} & set(found)
+    assert found["scale"] == "smoke"
+    check_parameters(notebook, found)
+
+
+WRONG = {
+    "a misspelt name": ({"sed": 3}, ["'sed'", "seed"]),
+    "a list under an unknown name": ({"rounds": [1, 2]}, ["'rounds'"]),
+    "text for a seed": ({"seed": "3"}, ["'seed'", "a whole number", "'3'"]),
+    "a fraction for a seed": ({"seed": 1.5}, ["'seed'", "a whole number", "1.5"]),
+    "a flag for a case": ({"case": True}, ["'case'", "a whole number", "True"]),
+    "a number for a scale": ({"scale": 1}, ["'scale'", "a text", "1"]),
+    "a negative seed": ({"seed": -1}, ["'seed'", "0 or more", "-1"]),
+    "an unknown case": ({"case": 9}, ["case_9.yaml"]),
+    "an unknown scale": ({"scale": "large"}, ["'scale'", "paper", "smoke", "'large'"]),
+    "an unknown variant": ({"variant": "best"}, ["'variant'", "improved", "printed", "'best'"]),
+    "a folder without parameters": ({"params_root": "/nowhere"}, ["/nowhere"]),
+}
+
+
+@pytest.mark.parametrize(("given", "says"), WRONG.values(), ids=WRONG)
+def test_a_wrong_parameter_ends_in_one_sentence(given, says):
+    sentence = refusal(check_parameters, OFFLINE, given)
+    assert all(part in sentence for part in says), sentence
+    assert refusal(open_session, OFFLINE, globals_of_a_kernel(OFFLINE, **given)) == sentence
+
+
+def test_no_seeds_at_all_is_refused():
+    assert "'seeds': expected 1 or more, found 0" in refusal(open_report, REPORT, globals_of_a_kernel(REPORT, seeds=0))
+
+
+@pytest.mark.parametrize(
+    ("notebook", "given"),
+    [("01_demonstrations", {"seeds": 3}), ("01_demonstrations", {"variant": "printed"}), (REPORT, {"seed": 1})],
+)
+def test_a_parameter_of_another_notebook_is_refused(notebook, given):
+    """`-p seeds 3` for `-p seed 3` would otherwise run seed 0 without a word."""
+    (name,) = given
+    assert f"'{name}'" in refusal(check_parameters, notebook, given)
+
+
+@pytest.mark.parametrize("scale", ["smoke", "paper"])
+def test_default_roots_do_not_depend_on_the_working_directory(monkeypatch, tmp_path, scale):
+    monkeypatch.chdir(tmp_path)
+    session = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, scale=scale))
+    assert session.input_root == PROJECT / ("notebooks/inputs" if scale == "smoke" else "results")
+    assert session.output_root == PROJECT / "results"
+    assert session.params_root == PROJECT / "params"
+    report = open_report(REPORT, globals_of_a_kernel(REPORT, scale=scale))
+    assert report.input_root == session.input_root
+    assert report.output_root == PROJECT / ("results/smoke/report" if scale == "smoke" else "reports/latest")
+    assert report.cases == (1, 2, 3)
+
+
+def test_given_roots_are_resolved_once(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    session = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, input_root="here", output_root=str(tmp_path / "there")))
+    monkeypatch.chdir("/")
+    assert session.folder(session.input_root, "stage") == tmp_path / "here/smoke/seed_0/case_1/stage"
+    assert session.folder(session.output_root, "stage", 3) == tmp_path / "there/smoke/seed_0/case_3/stage"
+
+
+def test_the_opening_cell_may_be_run_again_among_other_variables():
+    namespace = globals_of_a_kernel(OFFLINE)
+    first = open_session(OFFLINE, namespace)
+    namespace |= {"n_rounds": 3, "rows": [1], "session": first, "_session_opened": namespace["_session_opened"]}
+    assert open_session(OFFLINE, namespace).params == first.params
+    assert "'seed'" in refusal(open_session, OFFLINE, namespace | {"seed": -1})  # the parameters are still checked
+
+
+def test_the_scale_fixes_number_type_and_threads():
+    torch.set_num_threads(2)
+    session = open_session(OFFLINE, globals_of_a_kernel(OFFLINE))
+    assert torch.get_num_threads() == 1
+    assert session.dtype == session.task.set_point.dtype == torch.float64
+    assert open_session(OFFLINE, globals_of_a_kernel(OFFLINE, scale="paper")).dtype == torch.float32
+
+
+def test_streams_differ_by_seed_case_and_purpose():
+    draws = [
+        torch.randn(3, generator=open_session(OFFLINE, globals_of_a_kernel(OFFLINE, **given)).stream(purpose)).tolist()
+        for given, purpose in (({}, "a"), ({}, "b"), ({"seed": 1}, "a"), ({"case": 2}, "a"), ({}, "a"))
+    ]
+    assert draws[0] == draws[4]
+    assert len({tuple(draw) for draw in draws}) == 4
+
+
+def test_display_options_do_not_reach_the_files(tmp_path):
+    open_session(OFFLINE, globals_of_a_kernel(OFFLINE))
+    table = pd.DataFrame({"value": [1 / 3, 123456.789012345]})
+    assert save_stage(tmp_path / "stage", {}, {"t.csv": table}).table("t.csv").equals(table)
+
+
+def test_the_parameter_hash_changes_with_values_and_not_with_sources(tmp_path):
+    def hashed(old, new):
+        for path in (PROJECT / "params").glob("*.yaml"):
+            (tmp_path / path.name).write_text(path.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
+        return parameters_hash(check_parameters(OFFLINE, {"params_root": str(tmp_path)}))
+
+    same = parameters_hash(check_parameters(OFFLINE, {}))
+    assert hashed("source: trial over seeds", "source: thought about") == same
+    assert hashed("learning_rate_start: {value: 1.0e-2", "learning_rate_start: {value: 0.9e-2") != same
+
+
+def test_the_banner_says_smoke_and_links_the_full_run():
+    smoke = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, case=2)).banner().data
+    assert "smoke run" in smoke
+    assert "(../reports/reference/notebooks/02_offline_irl_case_2.ipynb)" in smoke
+    assert "smoke" not in open_session(OFFLINE, globals_of_a_kernel(OFFLINE, scale="paper")).banner().data
+    assert "reports/reference/report.html" in open_report(REPORT, globals_of_a_kernel(REPORT)).banner().data
+
+
+def test_a_saved_stage_records_where_it_comes_from(tmp_path):
+    session = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, seed=4, output_root=str(tmp_path)))
+    record = session.save("offline_improved", {"t.csv": pd.DataFrame({"a": [1]})}).record
+    assert {"notebook": OFFLINE, "case": 1, "seed": 4, "scale": "smoke", "variant": "improved"}.items() <= record.items()
+    assert record["inputs"] == session.inputs_now()
+    assert {"identity", "upstream", "revision", "versions", "seconds"} <= record.keys()
+    loaded = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, seed=4, input_root=str(tmp_path))).load("offline_improved", "02")
+    assert loaded.record == record
+
+
+def test_a_run_under_which_code_or_parameters_change_saves_nothing(tmp_path):
+    """As the notebook of a killed run may do, that lives on while its user edits and starts again."""
+    params = shutil.copytree(PROJECT / "params", tmp_path / "params")
+    given = globals_of_a_kernel(OFFLINE, params_root=str(params), output_root=str(tmp_path / "out"))
+    session = open_session(OFFLINE, given)
+    learning = params / "learning.yaml"
+    before = learning.read_text(encoding="utf-8")
+    learning.write_text(
+        before.replace("learning_rate_start: {value: 1.0e-2", "learning_rate_start: {value: 0.9e-2"), encoding="utf-8"
+    )
+    table = {"t.csv": pd.DataFrame({"a": [1]})}
+    assert "params/learning.yaml changed during the run; run it again" in refusal(session.save, "offline_improved", table)
+    assert not (tmp_path / "out").exists()
+    learning.write_text(f"# a comment\n{before}", encoding="utf-8")
+    assert session.save("offline_improved", table).record["inputs"] == session.made_from
+
+
+def test_a_result_names_the_earlier_results_that_it_read(tmp_path):
+    session = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, output_root=str(tmp_path)))
+    read = session.load("demonstrations", "01_demonstrations")
+    first = session.save("first", {"t.csv": pd.DataFrame({"a": [1]})}, last=False)
+    second = session.save("second", {"t.csv": pd.DataFrame({"a": [2]})})
+    assert first.record["upstream"] == {"case_1/demonstrations": read.content}
+    assert second.record["upstream"] == {"case_1/demonstrations": read.content, "case_1/first": first.content}
+    assert first.record["identity"] != second.record["identity"]

@@ -1,0 +1,176 @@
+"""The verbs of the notebooks at smoke scale, on the committed inputs: what they return, what they cost, that they repeat."""
+
+import copy
+import hashlib
+import os
+import subprocess
+import sys
+from functools import partial
+
+import pandas as pd
+import pytest
+import torch
+from safetensors.torch import save as save_tensors
+
+from helpers.learning.policy import LSTMPolicy
+from helpers.runs import stages
+from helpers.runs.artifacts import ArtifactError
+from helpers.runs.session import open_session
+from helpers.runs.sources import PROJECT
+
+EPOCHS_OF_THE_PAPER = {1: (300, [10, 10]), 2: (250, [10, 10]), 3: (80, [10, 10])}
+EPISODES_OF_AN_EPOCH = 500
+COST = {"epochs", "episodes", "gradient_steps"}
+FEATURES = {"C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III"}
+CONTROL = {"objective", "objective_x", "objective_y"}
+CONTROL |= {f"{kind}:{loop}" for kind in ("overshoot", "offset", "rise_time") for loop in ("C_A", "T")}
+CONTROL |= {"movement:C_A0", "movement:T_E"} | {f"v:{name}{what}" for name in FEATURES for what in ("", ":std")}
+
+
+def session(case=1, variant="improved", scale="smoke", **given):
+    namespace = {
+        "case": case,
+        "seed": 0,
+        "scale": scale,
+        "variant": variant,
+        "input_root": "",
+        "output_root": "",
+        "params_root": "",
+    }
+    return open_session("02_offline_irl", namespace | given)
+
+
+def learn(case=1, variant="improved"):
+    """Offline, then online, as notebooks 02 and 03 do; a hash of all that was learned comes with it."""
+    run = session(case, variant)
+    demonstrations = stages.load_demonstrations(run)
+    offline = stages.imitate(run, demonstrations, stages.fresh_policy(run))
+    online = stages.improve(run, copy.deepcopy(offline.policy), "x")
+    learned = b"".join(save_tensors(result.policy.state_dict()) for result in (offline, online)) + offline.weights.numpy().tobytes()
+    return run, demonstrations, offline, online, hashlib.sha256(learned).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def learned():
+    return learn()
+
+
+def test_demonstrations_are_what_notebook_01_recorded(learned):
+    run, demonstrations, *_ = learned
+    assert demonstrations.trajectories.n_trajectories == run.scale_params.demonstrations
+    assert demonstrations.trajectories.n_steps == run.params.process.horizon
+    assert demonstrations.trajectories.x.dtype == run.dtype
+    rows = pd.read_csv(run.folder(run.input_root, "demonstrations") / "scores.csv").set_index("metric")["value"]
+    assert demonstrations.true_features(run.feature_names).tolist() == pytest.approx(
+        [rows[f"v:{name}"] for name in run.feature_names]
+    )
+    # The few recorded trajectories and the many fresh ones are of one controller.
+    known, true = demonstrations.features(run.features), demonstrations.true_features(run.feature_names)
+    torch.testing.assert_close(known.double(), true.double(), rtol=0.15, atol=0)
+
+
+def test_figures_of_merit_have_the_names_that_the_report_reads(learned):
+    run, demonstrations, offline, online, _ = learned
+    trajectories = stages.fresh_trajectories(run, stages.deploy(run, offline.policy))
+    imitation = stages.judge_imitation(run, trajectories, demonstrations, offline)
+    expected = (
+        CONTROL | COST | {"feature_gap", "chosen_epoch"} | {f"{kind}:{name}" for kind in ("gap", "alpha") for name in FEATURES}
+    )
+    assert imitation.keys() == expected
+    gaps = [abs(imitation[f"gap:{name}"]) for name in FEATURES]
+    assert imitation["feature_gap"] == pytest.approx(sum(gaps) / len(gaps))
+    assert sum(imitation[f"alpha:{name}"] ** 2 for name in FEATURES) == pytest.approx(1)
+    improvement = stages.judge_improvement(run, trajectories, online)
+    assert improvement.keys() == CONTROL | COST
+    table = stages.score_table({"offline": imitation, "online": improvement})
+    assert list(table) == ["stage", "metric", "value"]
+    assert len(table) == len(imitation) + len(improvement)
+    assert table["value"].map(lambda value: isinstance(value, (int, float))).all()
+
+
+def test_records_of_learning_become_tables(learned):
+    run, _, offline, online, _ = learned
+    history = stages.history_table(offline.records, run.feature_names)
+    counted = ["iteration", "epochs", "episodes", "gradient_steps"]
+    assert list(history)[:4] == counted
+    assert {"mean_return", "feature_gap", "learning_rate", "policy_std", *(f"alpha:{name}" for name in FEATURES)} <= set(history)
+    assert (history[counted].diff().iloc[1:] > 0).all(axis=None)
+    assert list(stages.history_table(online.records, run.feature_names)["epochs"]) == [1, 2]
+    weights = stages.weight_table(run.feature_names, offline.weights)
+    assert dict(zip(weights["feature"], weights["alpha"], strict=True)) == dict(
+        zip(run.feature_names, offline.weights.tolist(), strict=True)
+    )
+
+
+def test_every_controller_meets_the_same_disturbances(learned):
+    run, _, offline, *_ = learned
+    expert, agent = (stages.fresh_trajectories(run, controller) for controller in (run.expert, stages.deploy(run, offline.policy)))
+    assert expert.n_trajectories == run.scale_params.evaluation
+    assert torch.equal(expert.x[0], agent.x[0])
+    assert torch.equal(expert.y[0], agent.y[0])
+    assert not torch.equal(expert.u, agent.u)
+
+
+def test_a_policy_comes_with_its_weights_also_from_another_case():
+    run = session(case=3)
+    policy, weights = stages.load_policy(run, "offline_improved", "02_offline_irl", 1)
+    assert isinstance(policy, LSTMPolicy)
+    rows = pd.read_csv(run.folder(run.input_root, "offline_improved", 1) / "weights.csv").set_index("feature")["alpha"]
+    assert weights.tolist() == [rows[name] for name in run.feature_names]
+
+
+@pytest.mark.parametrize("verb", ["load_demonstrations", "load_policy"])
+def test_a_missing_upstream_result_names_file_and_notebook(tmp_path, verb):
+    action = partial(stages.load_policy, stage="offline_improved", made_by="02_offline_irl")
+    with pytest.raises(ArtifactError, match=r"record\.json: this result is missing; run 0[12]_[a-z_]* for case 1 first"):
+        {"load_demonstrations": stages.load_demonstrations, "load_policy": action}[verb](session(input_root=str(tmp_path)))
+
+
+# Cost: never more than the paper -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", ["smoke", "paper"])
+@pytest.mark.parametrize("case", EPOCHS_OF_THE_PAPER)
+def test_the_parameters_ask_for_no_more_than_the_paper(case, scale):
+    run = session(case, scale=scale)
+    offline, online = EPOCHS_OF_THE_PAPER[case]
+    assert run.epochs(run.params.case.offline.epochs) <= offline
+    assert [run.epochs(n_epochs) for n_epochs in run.params.case.online.epochs] <= online
+    assert len(run.params.case.online.epochs) == len(online)
+    # An outer iteration, which measures the policy once, is never shorter than an epoch: see the test below.
+    assert run.scale_params.episodes + run.scale_params.measured <= EPISODES_OF_AN_EPOCH
+    assert run.params.learning.online.episodes <= EPISODES_OF_AN_EPOCH
+    if scale == "paper":
+        assert run.epochs(run.params.case.offline.epochs) == offline
+        assert run.scale_params.demonstrations == EPISODES_OF_AN_EPOCH
+
+
+@pytest.mark.parametrize(("case", "variant"), [(1, "improved"), (3, "printed")])
+def test_what_was_spent_stays_within_the_budget(learned, case, variant):
+    run, _, offline, online, _ = learned if (case, variant) == (1, "improved") else learn(case, variant)
+    epochs, rounds = EPOCHS_OF_THE_PAPER[case]
+    budget = run.scale_params.episodes + run.scale_params.measured
+    share = run.scale_params.epoch_share
+    for records, parts in ((offline.records, [epochs]), (online.records, rounds)):
+        assert records[-1].epochs <= sum(max(1, round(part * share)) for part in parts)
+        assert all(record.episodes <= budget * record.epochs for record in records)
+    assert 1 <= offline.chosen_epoch <= offline.records[-1].epochs
+    if variant == "printed":
+        assert all(record.gradient_steps == record.epochs for record in offline.records)
+        assert len(offline.records) <= run.params.case.offline.iterations
+
+
+# Repeating -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_rerun_is_bit_equal(learned):
+    assert learn()[-1] == learned[-1]
+
+
+@pytest.mark.torture
+def test_a_rerun_with_another_number_of_threads_is_bit_equal(learned):
+    """Other processes, whatever their environment says: the scale sets the threads."""
+    environment = os.environ | {"OMP_NUM_THREADS": "2", "MKL_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2", "TQDM_DISABLE": "1"}
+    command = [sys.executable, "-c", "import test_stages; print(test_stages.learn()[-1])"]
+    done = subprocess.run(command, cwd=PROJECT / "tests", env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == learned[-1]

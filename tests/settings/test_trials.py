@@ -1,0 +1,138 @@
+"""Trials of offline learning: what trials.yaml makes of a variant, what it must not touch, and its refusals."""
+
+from collections import Counter
+from typing import get_args
+
+import pytest
+import torch
+
+from helpers.runs import stages
+from helpers.runs.request import SessionError, check_parameters
+from helpers.runs.session import parameters_hash
+from helpers.settings.leaf import read_yaml
+from helpers.settings.paper import TrialParams, load, load_trials
+from tests.runs.test_stages import session
+from tests.settings.test_params import DELETE, edit, folder, refusal  # noqa: F401  (a fixture)
+
+TRIALS = "trials.yaml"
+
+
+def leaf(value, unit="-"):
+    return {"value": value, "unit": unit, "source": "a test", "status": "assumed"}
+
+
+def test_every_family_has_a_trial_and_every_trial_a_title_of_its_own(root):
+    trials = load_trials(root)
+    families = Counter(trial.family for trial in trials.values())
+    assert set(families) == set(get_args(TrialParams.model_fields["family"].annotation))
+    assert len({trial.title for trial in trials.values()}) == len(trials)
+    assert max(len(trial.title) for trial in trials.values()) <= 70
+    assert {trial.base for trial in trials.values()} == {"improved"}
+
+
+def test_a_trial_is_its_base_but_for_the_leaves_that_the_file_names(root):
+    variants = load(root, 1).learning.variants
+    for name, entry in read_yaml(root / TRIALS).items():
+        found, base = variants[name].model_dump(), variants["improved"].model_dump()
+        changed = {
+            (part, key): value
+            for part in ("learner", "weights", "exploration")
+            for key, value in (found[part] or {}).items()
+            if value != (base[part] or {}).get(key)
+        }
+        given = {
+            (part, key): leaf["value"]
+            for part in ("learner", "weights", "exploration")
+            for key, leaf in entry.get(part, {}).items()
+        }
+        assert changed == given, name
+
+
+def test_trials_leave_the_variants_the_leaves_and_their_hash_alone(folder, root):  # noqa: F811
+    edit(folder / TRIALS, {"undamped_weights.weights.decay.value": 0.2})
+    before, after = load(root, 1), load(folder, 1)
+    assert after.leaves == before.leaves
+    assert not [row for row in after.leaves if row["file"] == TRIALS]
+    assert parameters_hash(after) == parameters_hash(before)
+    assert after.learning.variants["undamped_weights"].weights.decay == 0.2
+    (folder / TRIALS).write_text("{}\n")
+    assert load(folder, 1).learning.variants == {name: before.learning.variants[name] for name in ("improved", "printed")}
+
+
+def test_the_variants_of_the_paper_use_none_of_the_optional_settings(root):
+    learning = load(root, 1).learning
+    for name in ("improved", "printed"):
+        variant = learning.variants[name]
+        assert (variant.exploration, variant.learner.entropy, variant.learner.trust_region) == (None, 0, None)
+
+
+REFUSED = [
+    ({"constant_step.base": "best"}, "constant_step.base", "improved, printed"),
+    ({"constant_step.base": "whole_return"}, "constant_step.base", "improved, printed"),
+    ({"constant_step.base": DELETE}, "constant_step.base", "missing"),
+    ({"constant_step.title": ""}, "constant_step.title", "1 character"),
+    ({"constant_step.family": "luck"}, "constant_step.family", "step size"),
+    ({"constant_step.policy": {}}, "constant_step.policy", "unknown"),
+    ({"constant_step.learner": 3}, "constant_step.learner", "keys and values"),
+    ({"constant_step.learner": DELETE}, "constant_step", "changes nothing"),
+    ({"constant_step.learner.learning_rate_end": 0.1}, "constant_step.learner.learning_rate_end", "value, unit, source, status"),
+    ({"constant_step.learner.learning_rate_end.value": 2.0}, "constant_step.learner.learning_rate_end", "less than or equal to 1"),
+    ({"constant_step.learner.learning_rate_end.unit": "s"}, "constant_step.learner.learning_rate_end", "unit"),
+    ({"constant_step.learner.rate": leaf(0.1)}, "constant_step.learner.rate", "unknown"),
+    ({"constant_step.learner.minibatches": leaf(41, "per pass")}, "constant_step.learner.minibatches", "40 episodes"),
+    ({"constant_step.learner.entropy": leaf(-0.1)}, "constant_step.learner.entropy", "greater than or equal to 0"),
+    ({"natural_gradient.learner.trust_region.value": 0.0}, "natural_gradient.learner.trust_region", "greater than 0"),
+    ({"wide_exploration.exploration.std_low": DELETE}, "wide_exploration.exploration.std_low", "missing"),
+    ({"wide_exploration.exploration.initial_std.value": 0.9}, "wide_exploration.exploration", "std_high"),
+    ({"improved": {"base": "printed", "title": "a", "family": "credit", "weights": {"step": leaf(0.1)}}}, "improved", "other than"),
+    ({"best/of": {"base": "printed"}}, "best/of", "small letters"),
+]
+
+
+@pytest.mark.parametrize(("changes", "key", "says"), REFUSED, ids=[str(list(changes)) + says for changes, _, says in REFUSED])
+def test_a_wrong_trial_is_named(folder, changes, key, says):  # noqa: F811
+    edit(folder / TRIALS, changes)
+    sentence = refusal(folder)
+    assert TRIALS in sentence, sentence
+    assert f"'{key}'" in sentence, sentence
+    assert says in sentence, sentence
+
+
+def test_a_missing_or_empty_file_is_named(folder):  # noqa: F811
+    (folder / TRIALS).write_text("# none\n")
+    assert TRIALS in refusal(folder)
+    (folder / TRIALS).unlink()
+    assert "trials.yaml: the parameter file is missing" in refusal(folder)
+
+
+def test_an_unknown_variant_is_refused_without_the_whole_list():
+    with pytest.raises(SessionError) as caught:
+        check_parameters("02_offline_irl", {"variant": "best"})
+    assert str(caught.value).endswith("expected one of improved, printed, a trial of params/trials.yaml, found 'best'")
+
+
+# Run at smoke scale
+
+
+def imitated(run):
+    return stages.imitate(run, stages.load_demonstrations(run), stages.fresh_policy(run))
+
+
+@pytest.fixture(scope="module")
+def improved():
+    return imitated(session())
+
+
+def test_a_trial_meets_the_random_numbers_of_its_base(improved):
+    """So where only what is kept in the end was changed, learning itself is the same."""
+    trial = imitated(session(variant="unaveraged_policy"))
+    assert trial.records == improved.records
+    kept = zip(trial.policy.parameters(), improved.policy.parameters(), strict=True)
+    assert not all(torch.equal(mine, its) for mine, its in kept)
+
+
+@pytest.mark.torture
+def test_exploration_is_that_of_the_trial(improved):
+    run = session(variant="wide_exploration")
+    assert imitated(run).records[0].policy_std == pytest.approx(run.variant_params.exploration.initial_std, rel=0.1)
+    assert improved.records[0].policy_std == pytest.approx(run.params.learning.policy.initial_std, rel=0.1)

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from helpers.learning.algorithm_1 import Reward
 from helpers.learning.features import FeatureMap
+from helpers.learning.learner import baseline_regressors, regression_advantage, surrogate, whole_return_advantage
 from helpers.learning.policy import RELU6_TOP, LSTMPolicy
-from helpers.learning.reinforce import Reward, baseline_regressors, regression_advantage, surrogate, whole_return_advantage
 from helpers.plant.process import LinearProcess
 from helpers.plant.task import ControlTask, Trajectories
 from helpers.settings.paper import LearnerParams
@@ -90,7 +91,7 @@ def weighed(batch: Trajectories, reward: Reward, features: FeatureMap, params: L
 
 
 class OneAtATime:
-    """A learner that draws its episodes one after the other; its attributes are those of `helpers.learning.reinforce.Learner`."""
+    """A learner that draws its episodes one after the other; its attributes are those of `helpers.learning.learner.Learner`."""
 
     def __init__(
         self,

@@ -8,7 +8,7 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from helpers.evidence.gym_environment import TrackingEnv
-from helpers.learning.maxent_irl import initial_weights
+from helpers.learning.algorithm_2 import initial_weights
 from helpers.plant.process import LinearProcess
 from helpers.plant.task import ControlTask
 from helpers.settings.paper import Params

@@ -13,10 +13,11 @@ import torch
 
 from benchmarks.one_at_a_time import OneAtATime
 from benchmarks.side_by_side import PROCESSES, SideBySide
+from helpers.learning.algorithm_1 import Reward, algorithm_1
+from helpers.learning.algorithm_2 import apprentice_reward, initial_weights
 from helpers.learning.features import FeatureMap
-from helpers.learning.maxent_irl import apprentice_reward, initial_weights
+from helpers.learning.learner import Learner
 from helpers.learning.policy import LSTMPolicy
-from helpers.learning.reinforce import Learner, Reward
 from helpers.plant.process import LinearProcess
 from helpers.plant.rollout import stream
 from helpers.plant.task import ControlTask
@@ -117,7 +118,7 @@ class Workload:
         policy, process, features, reward = self.parts(T)
         generator = stream(0, "benchmark", "learner")
         learner = Learner(policy, process, features, learner_params or self.learner_params, K, 10**6, generator)
-        return partial(learner.epoch, reward)
+        return partial(algorithm_1, learner, reward, 1)
 
     def ours(self, threads: int, K: int, T: int, epochs: int = 1) -> Subject:
         """Epochs of the project's learner."""

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from helpers.learning.features import FeatureMap
+from helpers.learning.learner import Learner
 from helpers.learning.policy import LSTMPolicy
-from helpers.learning.reinforce import Learner
 from helpers.plant.controllers import PID
 from helpers.plant.process import LinearProcess
 from helpers.plant.rollout import stream

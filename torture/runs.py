@@ -3,7 +3,6 @@
 import base64
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -16,7 +15,6 @@ from helpers.runs.artifacts import RECORD, load_stage
 from helpers.runs.sources import PROJECT
 
 PARTS = ("Snakefile", "params", "profiles", "src/helpers", "notebooks", "reports/template")
-INTERVAL = re.compile(r"checkpoint_interval: \{value: [0-9.]+")
 HIDDEN_BUT_KEPT = (".changed",)
 
 Content = dict[str, tuple[Mapping[str, str], Mapping[str, str], str]]  # stage: hashes of its files, its upstream, its identity
@@ -32,8 +30,8 @@ class Place:
     profile: str = "profiles/local"
 
     @classmethod
-    def copied(cls, folder: Path, interval: float = 0.2, **settings: Any) -> "Place":
-        """A copy of the project's code and parameters in `folder`, with a checkpoint every `interval` seconds."""
+    def copied(cls, folder: Path, **settings: Any) -> "Place":
+        """A copy of the project's code and parameters in `folder`."""
         for part in PARTS:
             source = PROJECT / part
             if source.is_dir():
@@ -41,10 +39,6 @@ class Place:
             else:
                 folder.mkdir(parents=True, exist_ok=True)
                 shutil.copy(source, folder / part)
-        path = folder / "params/learning.yaml"
-        text, n_changed = INTERVAL.subn(f"checkpoint_interval: {{value: {interval}", path.read_text(encoding="utf-8"))
-        assert n_changed > 0
-        path.write_text(text, encoding="utf-8")
         return cls(folder, **settings)
 
     @property

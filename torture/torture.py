@@ -79,8 +79,7 @@ def written(
         rows = {TITLES.get(name, name): f"{value:.0f}" for name, value in kills.row().items()}
         text += [
             "## Killed and resumed",
-            f"{WHOLE if whole else PART}, killed by signal 9 at random moments and resumed by the same command. The"
-            " interval between checkpoints was 0.2 s, so that kills meet them.",
+            f"{WHOLE if whole else PART}, killed by signal 9 at random moments and resumed by the same command.",
             to_markdown(pd.DataFrame({"what": rows.keys(), "number": rows.values()})),
             "Where a stage was just ending at the moment of the kill, the engine had not noted that it was done, and made it"
             " again: the same to the last bit.",

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from helpers.learning.cloning import clone, cloning_loss
-from helpers.learning.reinforce import TrainingError
+from helpers.learning.learner import TrainingError
 from helpers.plant.rollout import rollout, stream
 from helpers.settings.evidence import load_experiments
 

@@ -7,9 +7,9 @@ from torch.func import functional_call, jacrev
 from torch.nn.utils import parameters_to_vector
 
 from helpers.learning import natural
+from helpers.learning.learner import surrogate
 from helpers.learning.natural import fisher_product, precondition
 from helpers.learning.policy import PolicyController
-from helpers.learning.reinforce import surrogate
 from helpers.plant.rollout import rollout, stream
 
 F64 = torch.float64

@@ -13,7 +13,7 @@ import torch
 from benchmarks import benchmark, outcome, subjects, whole_run
 from benchmarks.one_at_a_time import OneAtATime, weighed
 from benchmarks.subjects import Subject, Workload
-from helpers.learning.reinforce import surrogate
+from helpers.learning.learner import surrogate
 from helpers.plant.rollout import stream
 from helpers.plant.task import Trajectories
 

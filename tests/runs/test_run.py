@@ -346,11 +346,11 @@ EDITS = [
     ("params/learning.yaml", "episodes: {value: 400", "episodes: {value: 300", {"report": 1}),  # of another scale
     ("params/published.yaml", "21.63", "21.64", {"report": 1}),
     ("notebooks/04_knowledge_transfer.ipynb", "carried = ", "taken = ", {"transfer": 1, "transfer_alone": 1}),
-    ("src/helpers/learning/maxent_irl.py", ADDED, "# a comment\n", {}),
-    ("src/helpers/learning/maxent_irl.py", '"""Algorithm 2', '"""The algorithm 2', {}),  # a docstring
+    ("src/helpers/learning/algorithm_2.py", ADDED, "# a comment\n", {}),
+    ("src/helpers/learning/algorithm_2.py", '"""Algorithm 2', '"""The algorithm 2', {}),  # a docstring
     ("src/helpers/report/tables.py", "def ", "def _(): ...\n\n\ndef ", {"report": 1}),
     ("reports/template/report.md.jinja", "# In one page", "# In a page", {}),  # Snakemake looks at it by itself
-    ("src/helpers/learning/maxent_irl.py", "return project(self.mean)", "return project(self.mean.clone())", LEARNT),
+    ("src/helpers/learning/algorithm_2.py", "return project(self.mean)", "return project(self.mean.clone())", LEARNT),
     ("src/helpers/report/report.py", "RUNNERS = (", "RUNNERS = (*(),", {"report": 1}),
     ("src/helpers/report/figures.py", "MUTED = ", "MUTED: str = ", {"report": 1}),
 ]
@@ -375,8 +375,8 @@ def test_a_change_makes_exactly_the_results_stale_that_are_made_from_it(source):
     ("changed", "old", "new", "jobs"),
     [
         ("params/case_2.yaml", "250", "249", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
-        pytest.param("src/helpers/learning/maxent_irl.py", ADDED, "# a comment\n", {}, marks=SLOW),
-        pytest.param("src/helpers/learning/maxent_irl.py", "(self.mean)", "(+self.mean)", ONE_SEED, marks=SLOW),
+        pytest.param("src/helpers/learning/algorithm_2.py", ADDED, "# a comment\n", {}, marks=SLOW),
+        pytest.param("src/helpers/learning/algorithm_2.py", "(self.mean)", "(+self.mean)", ONE_SEED, marks=SLOW),
         pytest.param("reports/template/report.md.jinja", "# In one page", "# In a page", {"report": 1}, marks=SLOW),
     ],
 )

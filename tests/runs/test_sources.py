@@ -33,7 +33,7 @@ def names_behind(notebook):
 @pytest.mark.parametrize(
     ("notebook", "among"),
     [
-        ("02_offline_irl", {"helpers.learning.maxent_irl", "helpers.runs.session"}),
+        ("02_offline_irl", {"helpers.learning.algorithm_2", "helpers.runs.session"}),
         pytest.param("05_report", {"helpers.report.collection"}, marks=pytest.mark.torture),
     ],
 )

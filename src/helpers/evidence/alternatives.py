@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from helpers.evidence.experiments import Prepared, Scores, copied, economical, gap_to, mode, predictive, varied
+from helpers.learning.algorithm_2 import initial_weights
 from helpers.learning.cloning import clone
 from helpers.learning.evaluation import feature_gap, objective
 from helpers.learning.features import FeatureMap
-from helpers.learning.maxent_irl import initial_weights
 from helpers.learning.policy import LSTMPolicy
 from helpers.plant.controllers import Controller, Operator
 from helpers.plant.rollout import rollout

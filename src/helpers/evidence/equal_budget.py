@@ -3,7 +3,7 @@
 Every learner gives a curve (the objective of its mode against the plant episodes spent) and its last controller.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,13 +16,15 @@ from torch import Tensor
 from helpers.evidence.alternatives import cloned
 from helpers.evidence.experiments import Prepared, copied
 from helpers.evidence.mpc import OffsetFreeMPC
+from helpers.learning.algorithm_1 import algorithm_1
 from helpers.learning.evaluation import objective
+from helpers.learning.learner import Learner
 from helpers.learning.policy import LSTMPolicy
-from helpers.learning.reinforce import Learner
 from helpers.plant.controllers import PID, Controller
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
 from helpers.runs import stages
+from helpers.runs.finished import State
 from helpers.runs.session import Session
 from helpers.settings.leaf import InputError
 from helpers.settings.limits import LimitsParams, LimitsScaleParams
@@ -94,6 +96,11 @@ class Visitor:
         """Whether so many episodes are a new point of the curve."""
         return episodes % self.contest.scale.every == 0 and all(episodes != spent for spent, *_ in self.curve)
 
+    @staticmethod
+    def read(rows: Sequence[Sequence[float]]) -> list[tuple[int, float, float]]:
+        """A curve as it was kept."""
+        return [(int(episodes), mean, error) for episodes, mean, error in rows]
+
     def __call__(self, episodes: int, controller: Controller) -> None:
         """Add a point."""
         returns = self.contest.returns(stages.fresh_trajectories(self.contest.session, controller, self.contest.scale.judged))
@@ -109,18 +116,17 @@ def reinforced(contest: Contest, start: LSTMPolicy, purpose: str, dense: bool) -
     features = session.features.on("x")
     generator = session.stream("limits", purpose)
     learner = Learner(policy, session.process, features, online.learner, contest.batch, n_epochs, generator)
-    memory = stages.memory(session, learner, purpose)
-    if (state := memory.recall()) is None:
+
+    def train() -> State:
         visitor(0, stages.deploy(session, learner.average))
-    else:
-        learner.restore(state["learner"])
-        visitor.curve = [(int(episodes), *judged) for episodes, *judged in state["curve"]]
-    while learner.epochs < n_epochs:
-        learner.epoch(partial(features.tracking, beta=contest.sharpness(learner.episodes, dense)))
-        if visitor.due(learner.episodes):
-            visitor(learner.episodes, stages.deploy(session, learner.average))
-        memory.keep(lambda: {"learner": learner.state(), "curve": visitor.curve}, finished=learner.epochs == n_epochs)
-    return Learned(partial(_deployed, learner.average), visitor.curve)
+        while learner.epochs < n_epochs:
+            algorithm_1(learner, partial(features.tracking, beta=contest.sharpness(learner.episodes, dense)), 1)
+            if visitor.due(learner.episodes):
+                visitor(learner.episodes, stages.deploy(session, learner.average))
+        return {"policy": learner.average.state_dict(), "curve": visitor.curve}
+
+    kept = stages.once(session, train, learner, purpose)
+    return Learned(partial(_deployed, stages.restored(policy, kept["policy"])), visitor.read(kept["curve"]))
 
 
 def _deployed(policy: LSTMPolicy, session: Session) -> Controller:
@@ -189,14 +195,13 @@ def from_library(contest: Contest, name: str) -> Learned:
         if visitor.due(episodes):
             visitor(episodes, build(session))
 
-    memory = session.checkpoint("library", name)
-    if (state := memory.recall()) is None:
+    def train() -> State:
         library.learn(model, session.task, contest.scale.episodes, partial(contest.sharpness, dense=True), visit)
-        memory.keep(lambda: {"policy": model.policy.state_dict(), "curve": visitor.curve}, finished=True)
-    else:
-        model.policy.load_state_dict(state["policy"])
-        visitor.curve = [(int(episodes), *judged) for episodes, *judged in state["curve"]]
-    return Learned(build, visitor.curve)
+        return {"policy": model.policy.state_dict(), "curve": visitor.curve}
+
+    kept = session.once(train, "library", name)
+    model.policy.load_state_dict(kept["policy"])
+    return Learned(build, visitor.read(kept["curve"]))
 
 
 def predictive(contest: Contest) -> Learned:

@@ -14,22 +14,16 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from helpers.learning.algorithm_1 import algorithm_1
+from helpers.learning.algorithm_2 import apprentice_reward
 from helpers.learning.evaluation import feature_gap
-from helpers.learning.maxent_irl import apprentice_reward
+from helpers.learning.learner import Learner, TrainingError, baseline_regressors, discounted_return, regression_advantage, surrogate
 from helpers.learning.policy import LSTMPolicy, PolicyController
-from helpers.learning.reinforce import (
-    Learner,
-    TrainingError,
-    baseline_regressors,
-    discounted_return,
-    regression_advantage,
-    reinforce_in_rounds,
-    surrogate,
-)
 from helpers.plant.controllers import Controller, SaturatedLQ
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
 from helpers.runs import stages
+from helpers.runs.finished import State
 from helpers.runs.progress import ProgressBar
 from helpers.runs.session import Session
 from helpers.settings.evidence import ComparisonParams, ExperimentCases, ExperimentParams, load_experiments
@@ -317,8 +311,12 @@ def learn_under(session: Session, weights: Tensor, n_epochs: int, label: str) ->
     policy = stages.fresh_policy(session)
     learner = Learner(policy, session.process, session.features, params, n_episodes, n_epochs, generator)
     reward = partial(apprentice_reward, features=session.features, weights=weights)
-    reinforce_in_rounds(learner, [(n_epochs, reward)], ProgressBar(n_epochs, label), stages.memory(session, learner, weights))
-    return learner.average
+
+    def train() -> State:
+        algorithm_1(learner, reward, n_epochs, params.patience, ProgressBar(n_epochs, label))
+        return {"policy": learner.average.state_dict()}
+
+    return stages.restored(policy, stages.once(session, train, learner, weights)["policy"])
 
 
 def frozen_weights(prepared: Prepared) -> Scores:

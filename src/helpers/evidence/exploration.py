@@ -9,8 +9,9 @@ from torch import Tensor
 
 from helpers.evidence.equal_budget import Contest
 from helpers.evidence.experiments import copied
+from helpers.learning.algorithm_1 import algorithm_1
+from helpers.learning.learner import Learner
 from helpers.learning.policy import LSTMPolicy
-from helpers.learning.reinforce import Learner
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
 from helpers.runs import stages
@@ -58,7 +59,7 @@ def _explore(contest: Contest, run: str, start: LSTMPolicy, betas: tuple[float, 
         for _ in range(n_epochs):
             twin = torch.Generator().set_state(generator.get_state())
             reward = Watched(contest, beta, [])
-            learner.epoch(reward)
+            algorithm_1(learner, reward, 1)
             paired = contest.returns(rollout(session.process, session.expert, session.task, contest.batch, twin))
             columns = {"run": run, "epoch": learner.epochs, "objective": reward.seen[0].numpy(), "expert": paired.numpy()}
             frames.append(pd.DataFrame(columns))

@@ -18,7 +18,7 @@ from helpers.evidence.readings import GAINS, MAIN, READINGS, TIME, Key, Reading,
 from helpers.learning.features import feature_names
 from helpers.plant.rollout import stream
 from helpers.runs import artifacts
-from helpers.runs.checkpoint import Checkpoints
+from helpers.runs.finished import Finished
 from helpers.runs.identity import digest
 from helpers.runs.session import IdentificationSession
 from helpers.settings.paper import Params
@@ -36,7 +36,7 @@ class Study:
 
     session: IdentificationSession
     sampling_error: Mapping[int, Vector]
-    finished: Checkpoints
+    finished: Finished
 
     @property
     def first(self) -> str:
@@ -129,10 +129,7 @@ class Study:
 
     def _once(self, compute: Callable[[], Mapping[str, Vector]], *what: Any) -> dict[str, Vector]:
         """Numbers that an interrupted run has left, or else what is computed now."""
-        place = self.finished.of(*what)
-        if (state := place.recall()) is None:
-            state = {name: values.tolist() for name, values in compute().items()}
-            place.keep(partial(dict, state), finished=True)
+        state = self.finished.once(lambda: {name: values.tolist() for name, values in compute().items()}, *what)
         return {name: np.array(values) for name, values in state.items()}
 
     def best(self, problem: Problem, fits: Sequence[Fit]) -> Fit:
@@ -168,9 +165,8 @@ def _what(problem: Problem) -> tuple[Any, ...]:
 
 def study(session: IdentificationSession) -> Study:
     """What every fit starts from."""
-    folder = session.output_root / session.scale / f"seed_{session.seed}" / f".checkpoints_{session.notebook}"
-    interval = next(iter(session.params.values())).learning.scales[session.scale].checkpoint_interval
-    finished = Checkpoints(folder, digest([session.made_from, session.seed, session.scale]), interval)
+    folder = session.output_root / session.scale / f"seed_{session.seed}" / f".finished_{session.notebook}"
+    finished = Finished(folder, digest([session.made_from, session.seed, session.scale]))
     return Study(session, sampling_errors(session, MAIN), finished)
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from helpers.learning.learner import TrainingError, annealed
 from helpers.learning.optimiser import Adam
 from helpers.learning.policy import LSTMPolicy
-from helpers.learning.reinforce import TrainingError, annealed
 from helpers.plant.task import ControlTask, Trajectories
 from helpers.settings.evidence import CloningParams
 

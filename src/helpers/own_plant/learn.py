@@ -14,11 +14,12 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from helpers.learning.algorithm_1 import improve_online
+from helpers.learning.algorithm_2 import Apprenticeship, algorithm_2, initial_weights
 from helpers.learning.evaluation import scores
 from helpers.learning.features import FeatureMap, feature_names
-from helpers.learning.maxent_irl import Apprenticeship, initial_weights, maxent_irl
+from helpers.learning.learner import EpochRecord, Learner
 from helpers.learning.policy import LSTMPolicy, PolicyController
-from helpers.learning.reinforce import EpochRecord, Learner, improve_online
 from helpers.own_plant.description import PlantDescription, load_description
 from helpers.own_plant.episodes import Episodes, episodes, stretches
 from helpers.own_plant.identify import Identified, Validation, hold_out, identify, thin_out, validate_model
@@ -170,7 +171,7 @@ def learn_offline(
     learner = Learner(policy, process, features, variant.learner, scale.episodes, n_epochs, generator)
     expert = features.trajectory(plant.demonstrations.trajectories).mean(0)
     progress = ProgressBar(n_epochs, "offline")
-    return maxent_irl(learner, expert, weights, variant.weights, n_epochs, scale.measured, progress)
+    return algorithm_2(learner, expert, weights, variant.weights, n_epochs, scale.measured, progress)
 
 
 def improve_on(plant: OwnPlant, policy: LSTMPolicy, process: Process, task: ControlTask) -> tuple[LSTMPolicy, list[EpochRecord]]:

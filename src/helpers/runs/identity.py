@@ -31,7 +31,6 @@ MORE_FILES = {
     "07_your_own_process": ("nonlinear_tank", "own_plant"),
     "08_claims": ("experiments", "published"),
 }
-NOT_OF_RESULTS = ("checkpoint_interval",)  # settings that cannot change a number
 UNKNOWN = "everything (an older kind of record)"
 
 
@@ -116,7 +115,7 @@ def _read_by(
     return {
         key: value
         for key, value in values.items()
-        if (len(parts[key]) < 2 or only.get(parts[key][0], parts[key][1]) == parts[key][1]) and parts[key][-1] not in NOT_OF_RESULTS
+        if (len(parts[key]) < 2 or only.get(parts[key][0], parts[key][1]) == parts[key][1])
     }
 
 

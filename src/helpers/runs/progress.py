@@ -4,8 +4,8 @@ import os
 
 from tqdm.auto import tqdm
 
-from helpers.learning.maxent_irl import IterationRecord
-from helpers.learning.reinforce import EpochRecord
+from helpers.learning.algorithm_2 import IterationRecord
+from helpers.learning.learner import EpochRecord
 
 
 class ProgressBar:

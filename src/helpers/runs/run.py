@@ -95,12 +95,12 @@ def _forget_dead_sockets() -> None:
                 shutil.rmtree(folder, ignore_errors=True)
 
 
-def _forget_checkpoints(notebook: str, parameters: dict[str, Any]) -> None:
-    """Remove the checkpoints of a notebook that has ended: what it skipped may have been its last stage."""
+def _forget_finished(notebook: str, parameters: dict[str, Any]) -> None:
+    """Remove the finished trainings of a notebook that has ended: what it skipped may have been its last stage."""
     place = [parameters.get(name) for name in ("scale", "seed", "case")]
     if None not in place:  # as the Snakefile gives them; a run by hand keeps its few files until the stage is run again
         folder = Path(parameters.get("output_root") or PROJECT / "results") / "{}/seed_{}/case_{}".format(*place)
-        shutil.rmtree(folder / f".checkpoints_{notebook}_{parameters.get('variant', HEADLINE)}", ignore_errors=True)
+        shutil.rmtree(folder / f".finished_{notebook}_{parameters.get('variant', HEADLINE)}", ignore_errors=True)
 
 
 def strip_machine(path: Path) -> None:
@@ -167,7 +167,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         sentence = f"{what}: {error.filename or given.output}: could not be written: {error.strerror or error}"
     else:
-        _forget_checkpoints(given.notebook, parameters)
+        _forget_finished(given.notebook, parameters)
         print(f"done: {what}")
         return 0
     print(f"error: {sentence}", file=sys.stderr)

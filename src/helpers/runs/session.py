@@ -1,7 +1,7 @@
 """What a notebook knows of its run: its parameters, checked, and the objects that they describe."""
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +19,7 @@ from helpers.plant.process import LinearProcess
 from helpers.plant.rollout import stream
 from helpers.plant.task import ControlTask
 from helpers.runs import artifacts
-from helpers.runs.checkpoint import Checkpoint, Checkpoints
+from helpers.runs.finished import Finished, State
 from helpers.runs.identity import changes, digest, identity, inputs, versions
 from helpers.runs.request import NOTEBOOK_PARAMETERS, SessionError, check_parameters, parameter_names
 from helpers.runs.sources import PROJECT
@@ -94,7 +94,7 @@ class Session(Run):
     params: Params
     scale_params: ScaleParams
     variant_params: VariantParams
-    checkpoints: Checkpoints
+    finished: Finished
 
     @property
     def dtype(self) -> torch.dtype:
@@ -171,12 +171,16 @@ class Session(Run):
         saved = artifacts.save_stage(self.folder(self.output_root, stage), self.origin(), tables, policy)
         self.upstream[f"case_{self.case}/{stage}"] = saved.content
         if last:
-            self.checkpoints.remove()
+            self.finished.remove()
         return saved
 
-    def checkpoint(self, *start: Any) -> Checkpoint:
-        """Where a training of this run keeps its state; `start`: all that it starts from beside the session's parameters."""
-        return self.checkpoints.of(self.params, *start)
+    def once(self, train: Callable[[], State], *start: Any) -> State:
+        """A training of this run, or what it gave before the run was interrupted; see `Finished.once`.
+
+        Args:
+            start: all that it starts from beside the session's parameters.
+        """
+        return self.finished.once(train, self.params, *start)
 
     def banner(self) -> Markdown:
         """What kind of run this is, for the top of the notebook."""
@@ -308,7 +312,7 @@ def open_session(notebook: str, namespace: dict[str, Any]) -> Session:
     case, seed = given.get("case", 1), given["seed"]
     output_root, params_root = _root(given, "output_root", "results"), _root(given, "params_root", "params")
     made_from = inputs(notebook, params_root, scale, case, variant)
-    hidden = output_root / scale / f"seed_{seed}" / f"case_{case}" / f".checkpoints_{notebook}_{variant}"
+    hidden = output_root / scale / f"seed_{seed}" / f"case_{case}" / f".finished_{notebook}_{variant}"
     return Session(
         notebook=notebook,
         seed=seed,
@@ -322,7 +326,7 @@ def open_session(notebook: str, namespace: dict[str, Any]) -> Session:
         params=params,
         scale_params=scale_params,
         variant_params=params.learning.variants[variant],
-        checkpoints=Checkpoints(hidden, digest([made_from, case, seed, scale, variant]), scale_params.checkpoint_interval),
+        finished=Finished(hidden, digest([made_from, case, seed, scale, variant])),
     )
 
 

@@ -1,6 +1,7 @@
 """The verbs of the notebooks: record, imitate, improve and judge, each for the case and scale of a session."""
 
-from collections.abc import Mapping, Sequence
+import copy
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -9,16 +10,17 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from helpers.learning.algorithm_1 import improve_online
+from helpers.learning.algorithm_2 import Apprenticeship, IterationRecord, algorithm_2, initial_weights
 from helpers.learning.evaluation import feature_gap, relative_gap, scores
 from helpers.learning.features import FeatureMap
-from helpers.learning.maxent_irl import Apprenticeship, IterationRecord, initial_weights, maxent_irl
+from helpers.learning.learner import EpochRecord, Learner
 from helpers.learning.policy import LSTMPolicy, PolicyController
-from helpers.learning.reinforce import EpochRecord, Learner, improve_online
 from helpers.plant.controllers import Controller
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
 from helpers.runs.artifacts import ArtifactError, trajectories_from_table
-from helpers.runs.checkpoint import Checkpoint
+from helpers.runs.finished import State
 from helpers.runs.progress import ProgressBar
 from helpers.runs.session import Session
 
@@ -86,31 +88,30 @@ def imitate(
     policy.reset_exploration(variant.exploration)
     generator = session.stream("offline", session.params.base(session.variant))
     learner = Learner(policy, session.process, features or session.features, variant.learner, scale.episodes, n_epochs, generator)
-    expert_features = demonstrations.features(learner.features)
-    return maxent_irl(
-        learner,
-        expert_features,
-        start,
-        variant.weights,
-        n_iterations,
-        scale.measured,
-        ProgressBar(n_epochs, "offline"),
-        memory(session, learner, expert_features, start),
-    )
+    v_expert = demonstrations.features(learner.features)
+
+    def train() -> State:
+        bar = ProgressBar(n_epochs, "offline")
+        found = algorithm_2(learner, v_expert, start, variant.weights, n_iterations, scale.measured, bar)
+        records = [asdict(record) for record in found.records]
+        return {"weights": found.weights, "policy": found.policy.state_dict(), "epoch": found.chosen_epoch, "records": records}
+
+    kept = once(session, train, learner, v_expert, start)
+    records = (IterationRecord(**row | {"weights": tuple(row["weights"])}) for row in kept["records"])
+    return Apprenticeship(kept["weights"], restored(policy, kept["policy"]), kept["epoch"], tuple(records))
 
 
-def memory(session: Session, learner: Learner, *more: Any) -> Checkpoint:
-    """Where a learner that has not begun keeps its state; `more`: what its training starts from beside learner and session."""
-    return session.checkpoint(
-        session.variant,
-        vars(learner.features),
-        learner.params,
-        learner.n_episodes,
-        learner.total_epochs,
-        learner.generator.get_state(),
-        *learner.policy.state_dict().values(),
-        *more,
-    )
+def once(session: Session, train: Callable[[], State], learner: Learner, *more: Any) -> State:
+    """A training by a learner that has not begun, once in a run; `more`: what it starts from beside learner and session."""
+    settings = (session.variant, vars(learner.features), learner.params, learner.n_episodes, learner.total_epochs)
+    return session.once(train, *settings, learner.generator.get_state(), *learner.policy.state_dict().values(), *more)
+
+
+def restored(like: LSTMPolicy, parameters: Mapping[str, Tensor]) -> LSTMPolicy:
+    """A policy like another one, with parameters of its own."""
+    policy = copy.deepcopy(like)
+    policy.load_state_dict(parameters)
+    return policy
 
 
 @dataclass(frozen=True)
@@ -135,9 +136,13 @@ def improve(session: Session, policy: LSTMPolicy, features_on: str, episodes: in
     learner = Learner(
         policy, session.process, session.features.on(features_on), learning.learner, n_episodes, sum(epochs), generator
     )
-    bar = ProgressBar(sum(epochs), f"online on {features_on}")
-    records = improve_online(learner, epochs, online.beta, bar, memory(session, learner, epochs, online.beta))
-    return Improvement(learner.average, tuple(records))
+
+    def train() -> State:
+        records = improve_online(learner, epochs, online.beta, ProgressBar(sum(epochs), f"online on {features_on}"))
+        return {"policy": learner.average.state_dict(), "records": [asdict(record) for record in records]}
+
+    kept = once(session, train, learner, epochs, online.beta)
+    return Improvement(restored(policy, kept["policy"]), tuple(EpochRecord(**row) for row in kept["records"]))
 
 
 def deploy(session: Session, policy: LSTMPolicy) -> PolicyController:

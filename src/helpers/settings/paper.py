@@ -131,7 +131,6 @@ class ScaleParams(Record):
     evaluation: Annotated[Count, Field(gt=1), Leaf("trajectories")]
     expert_evaluation: Annotated[Count, Field(gt=1), Leaf("trajectories")]
     epoch_share: Annotated[Share, Leaf("-")]
-    checkpoint_interval: Annotated[Positive, Leaf("s")]
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

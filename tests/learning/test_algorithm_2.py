@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.learning.algorithm_1 import algorithm_1
+from helpers.learning.algorithm_2 import WeightAscent, algorithm_2, initial_weights, maxent_gradient, project
 from helpers.learning.evaluation import expected_features
 from helpers.learning.features import linear_reward
-from helpers.learning.maxent_irl import WeightAscent, initial_weights, maxent_gradient, maxent_irl, project
+from helpers.learning.learner import TrainingError
 from helpers.learning.policy import LSTMPolicy, PolicyController
-from helpers.learning.reinforce import TrainingError
 from helpers.plant.rollout import rollout, stream
 
 F64 = torch.float64
@@ -160,7 +161,7 @@ def setting(case, n_episodes=6, total_epochs=6, seed=0, **changes):
 def test_epochs_are_shared_among_the_iterations_and_all_episodes_counted(study, weights_of, total, iterations, shares):
     learner, expert, start = setting(study(), total_epochs=total)
     seen = []
-    result = maxent_irl(learner, expert, start, weights_of(), iterations, 5, seen.append)
+    result = algorithm_2(learner, expert, start, weights_of(), iterations, 5, seen.append)
     assert [record.epochs for record in result.records] == shares
     assert [record.episodes for record in result.records] == [6 * done + 5 * (index + 1) for index, done in enumerate(shares)]
     assert [record.gradient_steps for record in result.records] == shares
@@ -173,7 +174,7 @@ def test_an_iteration_learns_under_the_weights_it_records(study, weights_of):
     case = study()
     learner, expert, start = setting(case, total_epochs=2)
     batch = rollout(case.process, PolicyController(case.policy(), case.task, True), case.task, 6, stream(0, "learner"))
-    result = maxent_irl(learner, expert, start, weights_of(), 2, 5)
+    result = algorithm_2(learner, expert, start, weights_of(), 2, 5)
     first, second = result.records
     np.testing.assert_allclose(first.weights, start, rtol=1e-12)
     expected = case.features.trajectory(batch).mean(0) @ start
@@ -186,7 +187,7 @@ def measured_after(case, record):
     """E[v] of the deployed policy after the first iteration of the run above, from the same draws."""
     learner, expert, start = setting(case, total_epochs=2)
     assert learner.total_epochs == 2 * record.epochs
-    learner.epoch(lambda batch: linear_reward(case.features.state(batch), start))
+    algorithm_1(learner, lambda batch: linear_reward(case.features.state(batch), start), 1)
     controller = PolicyController(learner.policy, case.task, exploring=False)
     found = expected_features(case.process, controller, case.features, 5, learner.generator).mean
     gap = ((found - expert).abs() / expert.abs()).mean().item()
@@ -199,7 +200,7 @@ def test_the_result_is_reproducible_bit_for_bit(study, weights_of):
 
     def run():
         learner, expert, start = setting(case, total_epochs=3)
-        return maxent_irl(learner, expert, start.float(), weights_of(scaled_by_expert=True), 3, 5)
+        return algorithm_2(learner, expert, start.float(), weights_of(scaled_by_expert=True), 3, 5)
 
     first, second = run(), run()
     assert first.records == second.records
@@ -212,7 +213,7 @@ def test_the_nearest_epoch_is_kept_where_asked(study, weights_of):
 
     def run(keep):
         learner, expert, start = setting(case, total_epochs=n_epochs, learning_rate_start=0.05, learning_rate_end=0.05)
-        return learner, maxent_irl(learner, expert, start, weights_of(keep_nearest=keep), n_epochs, 5)
+        return learner, algorithm_2(learner, expert, start, weights_of(keep_nearest=keep), n_epochs, 5)
 
     learner, last = run(False)
     gaps = [record.feature_gap for record in last.records]
@@ -225,15 +226,15 @@ def test_the_nearest_epoch_is_kept_where_asked(study, weights_of):
 
 def test_learning_goes_on_without_touching_the_kept_policy(study, weights_of):
     learner, expert, start = setting(study())
-    result = maxent_irl(learner, expert, start, weights_of(), 2, 5)
+    result = algorithm_2(learner, expert, start, weights_of(), 2, 5)
     before = [parameter.detach().clone() for parameter in result.policy.parameters()]
-    learner.epoch(lambda batch: batch.x[1:, :, 0])
+    algorithm_1(learner, lambda batch: batch.x[1:, :, 0], 1)
     assert all(torch.equal(a, b) for a, b in zip(result.policy.parameters(), before, strict=True))
 
 
 def test_early_stopping_ends_an_iteration_early(study, weights_of):
     learner, expert, start = setting(study(), total_epochs=20, patience=1, learning_rate_start=1e-5, learning_rate_end=1e-5)
-    result = maxent_irl(learner, expert, start, weights_of(), 2, 5)
+    result = algorithm_2(learner, expert, start, weights_of(), 2, 5)
     assert result.records[-1].epochs < 20
 
 
@@ -244,7 +245,7 @@ def test_features_come_nearer_the_experts(study, weights_of):
     expert = expected_features(case.process, case.pid, case.features, 200, stream(0, "expert")).mean
     learner = case.learner(case.policy(), 100, 40, variant.learner)
     start = initial_weights(variant.weights, 2, torch.float32)
-    gaps = [record.feature_gap for record in maxent_irl(learner, expert, start, variant.weights, 40, 50).records]
+    gaps = [record.feature_gap for record in algorithm_2(learner, expert, start, variant.weights, 40, 50).records]
     assert np.mean(gaps[-5:]) < 0.5 * gaps[0]
 
 
@@ -255,7 +256,7 @@ def test_any_number_of_variables_and_features(synthetic, n_controlled, n_manipul
     params = case.params.learning.variants[variant]
     learner = case.learner(case.policy(), 8, 4, params.learner)
     expert = torch.linspace(1, 2, 3 * n_controlled, dtype=F64)
-    result = maxent_irl(learner, expert, initial_weights(params.weights, n_controlled, F64), params.weights, 4, 5)
+    result = algorithm_2(learner, expert, initial_weights(params.weights, n_controlled, F64), params.weights, 4, 5)
     assert result.weights.shape == (3 * n_controlled,)
     assert isinstance(result.policy, LSTMPolicy)
     assert all(len(record.weights) == 3 * n_controlled for record in result.records)
@@ -276,4 +277,4 @@ def test_features_that_are_not_finite_end_training_with_the_epoch(study, weights
     with pytest.raises(
         TrainingError, match=r"epoch 2: .*not finite"
     ):  # two epochs of learning pass, the evaluation after them fails
-        maxent_irl(learner, expert, start, weights_of(), 3, 5)
+        algorithm_2(learner, expert, start, weights_of(), 3, 5)

@@ -1,15 +1,19 @@
-"""Algorithm 1: REINFORCE with baseline for the LSTM policy."""
+"""What Algorithm 1 is made of: returns and advantages, surrogates of the policy gradient, and the learner that takes the steps.
+
+As printed: the whole return less its mean over the batch, and one plain step an epoch. Ours are reward-to-go with a regression
+baseline, clipped steps on minibatches, an entropy bonus, a step size that falls, a running average of the weights, and the natural
+gradient.
+"""
 
 import copy
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from functools import partial
-from typing import Any, Protocol
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from helpers.learning.evaluation import expected_features
 from helpers.learning.features import FeatureMap, accumulated_error, discounts, normalised_error
 from helpers.learning.lstm import Tape
 from helpers.learning.natural import precondition
@@ -123,26 +127,6 @@ class EpochRecord:
     policy_std: float
 
 
-class Memory(Protocol):
-    """Where a training keeps its state, to go on from there after an interruption; see `checkpoint`."""
-
-    def recall(self) -> dict[str, Any] | None:
-        """The last state kept, if there is one."""
-
-    def keep(self, state: Callable[[], dict[str, Any]], finished: bool = False) -> None:
-        """Keep a state, if it is time to; only then is it asked for."""
-
-
-class NoMemory:
-    """A training that starts anew after an interruption."""
-
-    def recall(self) -> None:
-        """Nothing."""
-
-    def keep(self, state: Callable[[], dict[str, Any]], finished: bool = False) -> None:
-        """Nothing is kept."""
-
-
 class Learner:
     """A policy under Algorithm 1: its optimiser, the running average of its weights and what learning has cost so far.
 
@@ -177,34 +161,21 @@ class Learner:
         self.epochs = self.episodes = self.gradient_steps = 0
         self._tapes: list[Tape] = []
 
-    def state(self) -> dict[str, Any]:
-        """All that the next epochs depend on beside what the learner was made with; see `restore`."""
-        return {
-            "policy": self.policy.state_dict(),
-            "average": self.average.state_dict(),
-            "optimiser": self.optimiser.state_dict()["state"],
-            "generator": self.generator.get_state(),
-            "spent": [self.epochs, self.episodes, self.gradient_steps],
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from the state of a learner that was made alike: the next epochs are its next ones, to the last bit."""
-        self.policy.load_state_dict(state["policy"])
-        self.average.load_state_dict(state["average"])
-        moments = {int(index): entry for index, entry in state["optimiser"].items()}
-        self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": moments})
-        self.generator.set_state(state["generator"])
-        self.epochs, self.episodes, self.gradient_steps = state["spent"]
-
-    def epoch(self, reward: Reward) -> EpochRecord:
-        """One epoch: roll out, weigh, step. Raises TrainingError if the return or the gradient is not finite."""
-        params, gamma, task = self.params, self.features.params.discount, self.features.task
-        rate = annealed(params.learning_rate_start, params.learning_rate_end, self.epochs / max(1, self.total_epochs - 1))
-        recording = self.n_episodes <= BLOCK
+    def realise(self) -> Trajectories:
+        """Step 1 of Algorithm 1: K episodes of T steps under the exploring policy."""
+        task, recording = self.features.task, self.n_episodes <= BLOCK
         controller = PolicyController(self.policy, task, exploring=True, recording=recording, used=self._tapes)
         batch = rollout(self.process, controller, task, self.n_episodes, self.generator)
-        rewards = reward(batch)
-        returns = discounted_return(rewards, gamma)
+        self._tapes = controller.tapes
+        return batch
+
+    def advantage(self, rewards: Tensor, batch: Trajectories) -> Tensor:
+        """What each input earned beyond the baseline, in units of its spread over the batch; (T, K).
+
+        Raises:
+            TrainingError: if the return is not finite, or the same in every episode.
+        """
+        params, gamma = self.params, self.features.params.discount
         if params.credit == "whole_return":
             advantage = whole_return_advantage(rewards, gamma)
         else:
@@ -214,23 +185,50 @@ class Learner:
         spread = advantage.std()
         if not spread > 0:
             raise TrainingError(f"epoch {self.epochs + 1}: every episode earned the same reward, so there is nothing to learn from")
-        advantage = advantage / spread
+        return advantage / spread
+
+    def ascend(self, batch: Trajectories, advantage: Tensor) -> None:
+        """Step 2 of Algorithm 1: along the policy gradient, at this epoch's step size; then the average of the weights.
+
+        Raises:
+            TrainingError: if the gradient is not finite.
+        """
+        params = self.params
+        rate = annealed(params.learning_rate_start, params.learning_rate_end, self.epochs / max(1, self.total_epochs - 1))
         for group in self.optimiser.param_groups:
             group["lr"] = rate
-        self._tapes = controller.tapes
         self._ascend(batch, advantage)
         self.epochs += 1
         self.episodes += self.n_episodes
         self._update_average()
+
+    def record(self, rewards: Tensor, batch: Trajectories) -> EpochRecord:
+        """What the epoch that has just ended gave."""
+        returns = discounted_return(rewards, self.features.params.discount)
         return EpochRecord(
             self.epochs,
             self.episodes,
             self.gradient_steps,
             returns.mean().item(),
             returns.std().item() / self.n_episodes**0.5,
-            rate,
+            self.optimiser.param_groups[0]["lr"],
             self._exploration(batch),
         )
+
+    def expected_features(self, n_episodes: int) -> Tensor:
+        """E[v] of the policy's mode by Monte Carlo, Algorithm S1, shape (d,); its episodes count as spent.
+
+        The mode of the present policy, not the average of its weights: that would lag behind and make the reward weights swing.
+
+        Raises:
+            TrainingError: if the features are not finite.
+        """
+        mode = PolicyController(self.policy, self.features.task, exploring=False)
+        v = expected_features(self.process, mode, self.features, n_episodes, self.generator).mean
+        self.episodes += n_episodes
+        if not torch.isfinite(v).all():
+            raise TrainingError(f"epoch {self.epochs}: the trajectory features of the policy are not finite")
+        return v
 
     def _ascend(self, batch: Trajectories, advantage: Tensor) -> None:
         """Gradient steps on one batch, minibatch by minibatch, in one pass or more.
@@ -292,83 +290,3 @@ class Learner:
         with torch.no_grad():
             for average, current in zip(self.average.parameters(), self.policy.parameters(), strict=True):
                 average.lerp_(current, 1 - keep)
-
-
-def reinforce(
-    learner: Learner,
-    reward: Reward,
-    n_epochs: int,
-    patience: int = 0,
-    report: Callable[[EpochRecord], None] = lambda record: None,
-    earlier: Sequence[EpochRecord] = (),
-    keep: Callable[[Sequence[EpochRecord]], None] = lambda records: None,
-) -> list[EpochRecord]:
-    """Algorithm 1: at most `n_epochs` epochs under one reward; `report` is called with the record of each.
-
-    Early stopping: with `patience` > 0, stops once that many epochs in a row brought no better mean return.
-
-    Args:
-        earlier: records of the first of these epochs, where the learner has been through them already.
-        keep: called with all records after each epoch.
-    """
-    records = list(earlier)
-    while len(records) < n_epochs and not (patience and records and _epochs_since_best(records) >= patience):
-        records.append(learner.epoch(reward))
-        report(records[-1])
-        keep(records)
-    return records
-
-
-def _epochs_since_best(records: Sequence[EpochRecord]) -> int:
-    """How many epochs ago the mean return was best; of equals the last counts."""
-    best = max(range(len(records)), key=lambda index: (records[index].mean_return, index))
-    return len(records) - 1 - best
-
-
-def improve_online(
-    learner: Learner,
-    epochs: Sequence[int],
-    betas: Sequence[float],
-    report: Callable[[EpochRecord], None] = lambda record: None,
-    memory: Memory | None = None,
-) -> list[EpochRecord]:
-    """Online learning, Section 5.1.2: rounds of Algorithm 1 under the tracking objective, each with its own beta."""
-    rewards = [partial(learner.features.tracking, beta=beta) for beta in betas]
-    return reinforce_in_rounds(learner, list(zip(epochs, rewards, strict=True)), report, memory)
-
-
-def reinforce_in_rounds(
-    learner: Learner,
-    rounds: Sequence[tuple[int, Reward]],
-    report: Callable[[EpochRecord], None] = lambda record: None,
-    memory: Memory | None = None,
-) -> list[EpochRecord]:
-    """Rounds of Algorithm 1, each of so many epochs under a reward of its own.
-
-    With a memory it goes on where an interrupted run was.
-    """
-    memory = memory or NoMemory()
-    finished: list[EpochRecord] = []  # records of earlier rounds
-    started: list[EpochRecord] = []  # and of the interrupted one
-    first = 0
-    if (state := memory.recall()) is not None:
-        learner.restore(state["learner"])
-        first = state["round"]
-        finished, started = ([EpochRecord(**row) for row in state[name]] for name in ("finished", "started"))
-
-    def state_of(index: int, records: Sequence[EpochRecord]) -> dict[str, Any]:
-        return {
-            "learner": learner.state(),
-            "round": index,
-            "finished": [asdict(record) for record in finished],
-            "started": [asdict(record) for record in records],
-        }
-
-    def keep(index: int, records: Sequence[EpochRecord]) -> None:
-        memory.keep(partial(state_of, index, records))
-
-    for index, (n_epochs, reward) in list(enumerate(rounds))[first:]:
-        finished += reinforce(learner, reward, n_epochs, learner.params.patience, report, started, partial(keep, index))
-        started = []
-    memory.keep(partial(state_of, len(rounds), []), finished=True)
-    return finished

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.learning.policy import PolicyController
-from helpers.learning.reinforce import (
+from helpers.learning.algorithm_1 import algorithm_1
+from helpers.learning.learner import (
     Learner,
     TrainingError,
     annealed,
@@ -16,11 +16,11 @@ from helpers.learning.reinforce import (
     clipped_surrogate,
     discounted_return,
     regression_advantage,
-    reinforce,
     reward_to_go,
     surrogate,
     whole_return_advantage,
 )
+from helpers.learning.policy import PolicyController
 from helpers.plant.process import LinearProcess
 from helpers.plant.rollout import rollout, stream
 
@@ -252,7 +252,7 @@ def test_the_first_step_climbs_the_gradient(study, settings):
     advantage = whole_return_advantage(closeness_reward(case)(batch), 0.99)
     surrogate(policy.log_probability(batch.y, batch.u, batch.command, case.task), advantage / advantage.std()).backward()
     gradient = {name: value.grad.clone() for name, value in policy.named_parameters()}
-    learner.epoch(closeness_reward(case))
+    algorithm_1(learner, closeness_reward(case), 1)
     for name, value in policy.named_parameters():
         clear = gradient[name].abs() > 1e-4  # Adam's small constant shortens the step where the gradient is tiny
         torch.testing.assert_close(
@@ -264,7 +264,7 @@ def test_the_first_step_climbs_the_gradient(study, settings):
 def test_epochs_episodes_and_gradient_steps_are_counted(study, settings, passes, minibatches):
     case = study()
     learner = case.learner(case.policy(), 8, 3, settings(passes=passes, minibatches=minibatches))
-    records = reinforce(learner, closeness_reward(case), 3)
+    records = algorithm_1(learner, closeness_reward(case), 3)
     assert (len(records), learner.epochs, learner.episodes, learner.gradient_steps) == (3, 3, 24, 3 * passes * minibatches)
 
 
@@ -290,7 +290,7 @@ def test_a_second_pass_starts_from_the_policy_that_the_first_one_left(study, set
         optimiser.zero_grad()
         (-gain).backward()
         optimiser.step()
-    learner.epoch(reward)
+    algorithm_1(learner, reward, 1)
     for value, expected in zip(learner.policy.parameters(), reference.parameters(), strict=True):
         torch.testing.assert_close(value.detach(), expected.detach(), rtol=1e-6, atol=1e-7)
 
@@ -300,7 +300,7 @@ def test_the_record_of_an_epoch_is_that_of_its_batch(study, settings):
     policy = case.policy()
     batch = rollout(case.process, PolicyController(policy, case.task, True), case.task, 20, stream(0, "learner"))
     returns = discounted_return(closeness_reward(case)(batch), 0.99)
-    record = case.learner(policy, 20, 1, settings()).epoch(closeness_reward(case))
+    record = algorithm_1(case.learner(policy, 20, 1, settings()), closeness_reward(case), 1)[0]
     assert record.mean_return == pytest.approx(returns.mean().item(), rel=1e-12)
     assert record.standard_error == pytest.approx(returns.numpy().std(ddof=1) / np.sqrt(20), rel=1e-12)
     assert record.policy_std == pytest.approx(policy.params.initial_std, rel=0.2)  # in units of the input range, after one step
@@ -310,7 +310,7 @@ def test_the_learning_rate_falls_along_half_a_cosine(study, settings):
     assert [annealed(3.0, 1.0, progress) for progress in (0.0, 0.5, 1.0)] == pytest.approx([3.0, 2.0, 1.0], rel=1e-14)
     case = study()
     learner = case.learner(case.policy(), 4, 5, settings(learning_rate_start=4e-3, learning_rate_end=1e-3))
-    rates = [record.learning_rate for record in reinforce(learner, closeness_reward(case), 5)]
+    rates = [record.learning_rate for record in algorithm_1(learner, closeness_reward(case), 5)]
     assert rates[0] == pytest.approx(4e-3)
     assert rates[-1] == pytest.approx(1e-3)
     assert all(later < earlier for earlier, later in pairwise(rates))
@@ -323,7 +323,7 @@ def test_the_average_is_a_running_mean_of_the_weights(study, settings, averaging
     learner = case.learner(case.policy(), 8, 6, settings(averaging=averaging))
     history = [learner.policy.output.bias.detach().clone()]
     for _ in range(6):
-        learner.epoch(closeness_reward(case))
+        algorithm_1(learner, closeness_reward(case), 1)
         history.append(learner.policy.output.bias.detach().clone())
     average, span = learner.average.output.bias.detach(), torch.stack(history)
     if averaging == 0:
@@ -341,7 +341,7 @@ def test_learning_is_reproducible_bit_for_bit(study, settings, credit, minibatch
 
     def learned():
         learner = case.learner(case.policy(), 10, 3, settings(credit=credit, minibatches=minibatches))
-        reinforce(learner, closeness_reward(case), 3)
+        algorithm_1(learner, closeness_reward(case), 3)
         return torch.cat([parameter.detach().flatten() for parameter in learner.policy.parameters()])
 
     first = learned()
@@ -357,7 +357,7 @@ def test_a_few_epochs_raise_the_return_on_an_easy_task(study, variant):
         update={"learning_rate_start": 1e-2, "learning_rate_end": 1e-2, "patience": 0}
     )
     learner = case.learner(case.policy(), 100, 25, params)
-    returns = [record.mean_return for record in reinforce(learner, closeness_reward(case, 1.0), 25)]
+    returns = [record.mean_return for record in algorithm_1(learner, closeness_reward(case, 1.0), 25)]
     assert np.mean(returns[-3:]) > returns[0] + 20
 
 
@@ -367,7 +367,7 @@ def test_an_entropy_bonus_keeps_exploration_up(study, settings, minibatches):
 
     def spread(bonus):
         params = settings(credit="reward_to_go", entropy=bonus, minibatches=minibatches, learning_rate_start=3e-2)
-        return reinforce(case.learner(case.policy(), 20, 8, params), closeness_reward(case), 8)[-1].policy_std
+        return algorithm_1(case.learner(case.policy(), 20, 8, params), closeness_reward(case), 8)[-1].policy_std
 
     assert spread(1.0) > spread(0.0) + 0.003
 
@@ -378,7 +378,7 @@ def test_the_natural_gradient_raises_the_return_on_an_easy_task(study, settings)
     case = study(1, torch.float32)
     changes = {"credit": "reward_to_go", "trust_region": 0.1, "learning_rate_start": 1.0, "learning_rate_end": 1.0}
     learner = case.learner(case.policy(), 100, 25, settings(**changes))
-    returns = [record.mean_return for record in reinforce(learner, closeness_reward(case, 1.0), 25)]
+    returns = [record.mean_return for record in algorithm_1(learner, closeness_reward(case, 1.0), 25)]
     assert np.mean(returns[-3:]) > returns[0] + 20
 
 
@@ -386,7 +386,7 @@ def test_any_number_of_variables(synthetic, settings):
     for n_controlled, n_manipulated in ((1, 1), (3, 3), (3, 2)):
         case = synthetic(n_controlled, n_manipulated)
         learner = case.learner(case.policy(), 6, 2, settings(credit="reward_to_go"))
-        assert len(reinforce(learner, closeness_reward(case), 2)) == 2
+        assert len(algorithm_1(learner, closeness_reward(case), 2)) == 2
 
 
 # Early stopping
@@ -416,7 +416,7 @@ def scripted(levels):
 def test_early_stopping_by_patience(study, settings, levels, patience, expected):
     case = study()
     learner = case.learner(case.policy(), 4, 6, settings())
-    records = reinforce(learner, scripted(levels), 6, patience)
+    records = algorithm_1(learner, scripted(levels), 6, patience)
     assert len(records) == learner.epochs == expected
 
 
@@ -438,7 +438,7 @@ def test_a_process_that_returns_nan_ends_training_with_the_epoch(study, settings
     process = Failing(case.params.process, F64)
     learner = Learner(case.policy(), process, case.features, settings(), 4, 5, stream(0))
     with pytest.raises(TrainingError, match=r"epoch 2: .*not finite"):
-        reinforce(learner, closeness_reward(case), 5)
+        algorithm_1(learner, closeness_reward(case), 5)
     assert learner.epochs == 1
     assert all(torch.isfinite(parameter).all() for parameter in learner.policy.parameters())
 
@@ -446,11 +446,11 @@ def test_a_process_that_returns_nan_ends_training_with_the_epoch(study, settings
 def test_a_policy_that_has_turned_nan_ends_training_with_the_epoch(study, settings):
     case = study()
     learner = case.learner(case.policy(), 4, 5, settings())
-    learner.epoch(closeness_reward(case))
+    algorithm_1(learner, closeness_reward(case), 1)
     with torch.no_grad():
         learner.policy.layers[1].bias_hh_l0[3] = float("nan")
     with pytest.raises(TrainingError, match=r"epoch 2: .*not finite"):
-        learner.epoch(closeness_reward(case))
+        algorithm_1(learner, closeness_reward(case), 1)
 
 
 @pytest.mark.parametrize("minibatches", [1, 3])
@@ -460,7 +460,7 @@ def test_a_gradient_that_is_not_finite_ends_training_before_the_step(study, sett
     before = policy.output.weight.detach().clone()
     policy.output.bias.register_hook(lambda gradient: gradient * float("inf"))
     with pytest.raises(TrainingError, match=r"epoch 1: the gradient of output\.bias is not finite"):
-        case.learner(policy, 6, 5, settings(minibatches=minibatches)).epoch(closeness_reward(case))
+        algorithm_1(case.learner(policy, 6, 5, settings(minibatches=minibatches)), closeness_reward(case), 1)[0]
     assert torch.equal(policy.output.weight, before)
 
 
@@ -470,7 +470,7 @@ def test_an_absurd_learning_rate_gives_numbers_or_the_epoch(study, settings, rat
     case = study(1, torch.float32)
     learner = case.learner(case.policy(), 4, 3, settings(learning_rate_start=rate, learning_rate_end=rate))
     try:
-        returns = [record.mean_return for record in reinforce(learner, closeness_reward(case), 3)]
+        returns = [record.mean_return for record in algorithm_1(learner, closeness_reward(case), 3)]
     except TrainingError:
         return
     assert np.isfinite(returns).all()
@@ -482,4 +482,4 @@ def test_a_reward_without_spread_ends_training_with_the_cause(study, settings, c
     case = study()
     learner = case.learner(case.policy(), 4, 5, settings(credit=credit))
     with pytest.raises(TrainingError, match=r"epoch 1: .*(reward|return)"):
-        learner.epoch(lambda batch: torch.zeros(batch.n_steps, batch.n_trajectories, dtype=F64))
+        algorithm_1(learner, lambda batch: torch.zeros(batch.n_steps, batch.n_trajectories, dtype=F64), 1)

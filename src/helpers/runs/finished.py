@@ -1,0 +1,113 @@
+"""Trainings that need not be repeated: what each one of a run gave is kept on disk until the run's results are written.
+
+A state is a nested structure of dictionaries, lists, numbers, texts and tensors. The tensors go into a safetensors file and the
+rest into its header as JSON, so that nothing that is read executes code. A file belongs to one training: its name and header hold
+a hash of all that the training starts from. That of another training, or of other code, is never read.
+"""
+
+import hashlib
+import json
+import shutil
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from helpers.runs.scratch import beside, sweep
+
+State = dict[str, Any]
+TENSOR = "tensor:"  # marks, in the JSON, the place of a tensor
+
+
+@dataclass(frozen=True)
+class Finished:
+    """The trainings that a run of a notebook has finished, in a hidden folder beside its results.
+
+    An interrupted run so loses no more than the training that it was in.
+
+    Attributes:
+        identity: hash of what the run is made from.
+    """
+
+    folder: Path
+    identity: str
+
+    def once(self, train: Callable[[], State], *start: Any) -> State:
+        """What the training that starts from these objects gives: as an interrupted run has left it, or computed now and kept.
+
+        Args:
+            start: tensors, or what has a complete `repr`.
+        """
+        content = hashlib.sha256(self.identity.encode())
+        for part in start:
+            content.update(part.detach().numpy().tobytes() if isinstance(part, Tensor) else repr(part).encode())
+        training = content.hexdigest()
+        path = self.folder / f"{training[:16]}.safetensors"
+        if (state := _read(path, training)) is None:
+            state = train()
+            _write(path, training, state)
+        return state
+
+    def remove(self) -> None:
+        """Remove them all: the results are written."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _read(path: Path, training: str) -> State | None:
+    """The state in a file; None where there is none, or none of this training."""
+    try:
+        with safe_open(path, "pt") as file:
+            header = file.metadata() or {}
+            if header.get("training") != training:
+                return None
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dictionary)
+            state: State = _assemble(json.loads(header["state"]), tensors)
+            return state
+    except (OSError, SafetensorError, KeyError, ValueError):  # missing or damaged: the training is repeated
+        return None
+
+
+def _write(path: Path, training: str, state: State) -> None:
+    """Keep a state. On a full disk the run goes on: it only saves time."""
+    tensors: dict[str, Tensor] = {}
+    plain = json.dumps(_take_apart(state, tensors))
+    partial = beside(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        sweep(path)
+        partial.write_bytes(save(tensors, {"training": training, "state": plain}))
+        partial.replace(path)
+    except OSError as error:
+        warnings.warn(f"{path}: a finished training could not be kept: {error.strerror}", stacklevel=2)
+        with suppress(OSError):
+            partial.unlink()
+
+
+def _take_apart(value: Any, tensors: dict[str, Tensor]) -> Any:
+    """The same structure with the name of a tensor in place of each, and the tensors by these names."""
+    if isinstance(value, Tensor):
+        name = str(len(tensors))
+        tensors[name] = value.detach().clone().contiguous()
+        return TENSOR + name
+    if isinstance(value, dict):
+        return {str(key): _take_apart(entry, tensors) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_take_apart(entry, tensors) for entry in value]
+    return value
+
+
+def _assemble(value: Any, tensors: dict[str, Tensor]) -> Any:
+    """The inverse of `_take_apart`; tuples come back as lists."""
+    if isinstance(value, str) and value.startswith(TENSOR):
+        return tensors[value.removeprefix(TENSOR)]
+    if isinstance(value, dict):
+        return {key: _assemble(entry, tensors) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_assemble(entry, tensors) for entry in value]
+    return value

@@ -120,7 +120,6 @@ def test_an_interrupted_run_does_not_repeat_a_learner_that_has_ended(root, tmp_p
     contest = limits.enter(open_session("06_limits_and_alternatives", given))
     scale = contest.scale.model_copy(update={"episodes": 100, "every": 50, "judged": 20})
     contest = equal_budget.Contest(contest.prepared, contest.params.model_copy(update={"scales": {"smoke": scale}}))
-    contest.session.checkpoints.interval = 0.0
     first = equal_budget.from_library(contest, name)
     monkeypatch.setattr("helpers.evidence.library_learners.learn", None)
     again = equal_budget.from_library(contest, name)

@@ -79,6 +79,7 @@ def project(monkeypatch, tmp_path):
         latest / "notebooks/05_report.ipynb": "05",
         results / "paper/seed_0/case_1/notebooks/02_offline_irl_improved.ipynb": "02",
         results / "paper/seed_0/case_1/notebooks/02_offline_irl_printed.ipynb": "02 printed",
+        results / "paper/seed_0/case_1/notebooks/02_offline_irl_whole_return.ipynb": "02 of a trial",
         results / "paper/seed_0/case_3/notebooks/01_demonstrations.ipynb": "01",
         results / "paper/seed_0/case_3/notebooks/.01_demonstrations.123.ipynb": "what a killed run left",
         results / "paper/seed_1/case_3/notebooks/01_demonstrations.ipynb": "01 of another seed",
@@ -99,7 +100,7 @@ def test_publishing_copies_the_report_and_the_executed_notebooks_of_the_first_se
     old.parent.mkdir()
     old.write_text("of the run before")
     (old.parent / "reliability.md").write_text("of make torture")
-    assert publish.main() == 0
+    assert publish.main([]) == 0
     reference = project / "reports/reference"
     found = {str(path.relative_to(reference)) for path in reference.rglob("*") if path.is_file()}
     assert found == {
@@ -113,7 +114,7 @@ def test_publishing_copies_the_report_and_the_executed_notebooks_of_the_first_se
 
 
 def test_publishing_writes_the_numbers_into_readme(project):
-    assert publish.main() == 0
+    assert publish.main([]) == 0
     lines = (project / "README.md").read_text(encoding="utf-8").splitlines()
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith(("| I ", "| II "))]
     assert rows[0] == ["I", "1.0 % [0.9, 1.2]", "10.0 %", "20.0 % [15.0, 31.0]", "40.0 %", "95.1 %"]
@@ -128,7 +129,7 @@ def test_the_gaps_to_the_optimum_of_the_sharpest_objective_are_written_where_the
     columns = 'controller,"I, $\\beta$ = 10","I, $\\beta$ = 30","III, $\\beta$ = 10","III, $\\beta$ = 30"'
     rows = ["PID (demonstrator),1.0,2.0,3.0,4.5", 'offset-free MPC,5.0,"6.0 [5.0, 7.0]",7.0,8.0', "programme on x,0.0,0.0,0.0,0.0"]
     (project / "reports/latest/tables/limits_gaps.csv").write_text("\n".join([columns, *rows, ""]))
-    assert publish.main() == 0
+    assert publish.main([]) == 0
     lines = (project / "README.md").read_text(encoding="utf-8").splitlines()
     first = lines.index("<!-- limits: c -->") + 1
     table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[first : lines.index("<!-- /limits -->")]]
@@ -151,7 +152,7 @@ def published(project):
 
 def refused(capsys, status):
     """The one sentence with which publishing ends."""
-    assert publish.main() == status
+    assert publish.main([]) == status
     said = capsys.readouterr().err
     assert said.startswith("error: ")
     assert said.count("\n") == 1
@@ -196,7 +197,7 @@ def test_a_report_without_the_evidence_of_the_published_one_does_not_replace_it(
     assert f"the run lacks tables/{table}, which the published one has" in refused(capsys, 2)
     assert content() == before
     (project / "reports/latest/tables" / table).write_text('controller,"I, $\\beta$ = 30"\n')
-    assert publish.main() == 0
+    assert publish.main([]) == 0
 
 
 @pytest.mark.parametrize("part", ["figures", "seeds.csv", "tables/time.csv", "notebooks/05_report.ipynb"])

@@ -34,7 +34,7 @@ def test_a_notebook_that_fails_stays_as_it_was_and_nothing_is_left_beside_it(not
     path = notebook(divisor=0)
     before = path.read_bytes()
     with pytest.raises(PapermillExecutionError):
-        refresh.main()
+        refresh.main([])
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]
 
@@ -43,7 +43,7 @@ def test_a_notebook_that_succeeds_holds_its_outputs_and_no_mark_of_an_earlier_fa
     """As papermill by hand leaves such marks, with a tag, by which papermill itself finds and drops them."""
     mark = nbformat.v4.new_markdown_cell("An Exception was encountered", metadata={"tags": ["papermill-error-cell-tag"]})
     path = notebook(2, mark)
-    assert refresh.main() == 0
+    assert refresh.main([]) == 0
     (cell,) = nbformat.read(path, as_version=4).cells
     assert cell.outputs[0].data["text/plain"] == "0.5"
     assert list(path.parent.iterdir()) == [path]

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import re
 import shutil
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,6 +20,7 @@ LATEST, REFERENCE, RESULTS = PROJECT / "reports/latest", PROJECT / "reports/refe
 LIMITS = "tables/limits_gaps.csv"
 # Of README's gaps to the optimum:
 SHOWN = ("expert", "online", *LEARNERS, "mpc", "minimum_variance", "dynamic_programme_filtered")
+LEARNT, VARIANTS = re.compile(r"0[24]_(?:offline_irl|knowledge_transfer)_(\w+)"), ("improved", "printed")
 PARTS = ("report.html", "figures", "tables", "comparison.csv", "seeds.csv", "provenance.json")
 
 
@@ -118,10 +120,14 @@ def check_tables(latest: Path, reference: Path) -> None:
 
 
 def executed_copies(first: Path) -> dict[str, Path]:
-    """The executed copies to publish, by their published names; `first` is the folder of the first seed's results."""
+    """The executed copies to publish, by their published names; `first` is the folder of the first seed's results.
+
+    Those of the trials of offline learning stay behind: their numbers stand in a table of the report.
+    """
     copies = {
         f"{path.stem.removesuffix('_improved')}_{path.parents[1].name}.ipynb": path
         for path in sorted(first.glob("case_*/notebooks/[!.]*.ipynb"))
+        if not (found := LEARNT.fullmatch(path.stem)) or found[1] in VARIANTS
     }
     copies["05_report.ipynb"] = LATEST / "notebooks/05_report.ipynb"
     if (first / "inferred_settings").is_dir():

@@ -16,13 +16,13 @@ import pandas as pd
 import pypandoc
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
-from PIL import Image
 
 from helpers.evidence.readings import MAIN
 from helpers.report import drawings, figures, limits_findings, limits_report, scorecard, statistics, tables
 from helpers.report.collection import ONLINE, Results
 from helpers.runs.artifacts import ArtifactError, code_revision
 from helpers.runs.identity import digest, versions
+from helpers.runs.pictures import smaller
 from helpers.runs.scratch import beside, sweep
 from helpers.runs.session import parameters_hash
 from helpers.runs.sources import PROJECT
@@ -30,7 +30,7 @@ from helpers.settings.paper import OnlineParams
 
 RUNNERS = ("papermill", "snakemake", "pypandoc_binary")  # packages that shape no number
 SHOWN_AS_PIXELS = ("figure_3",)  # in README, where a reader without a browser of its own meets it
-COLOURS = 128  # of a PNG: a third of the size, and no difference that the eye sees
+LONGEST_TWIN = 100  # rows of a table that is written as Markdown too, for reading
 PROVENANCE = "provenance.json"
 OWN_ERROR = "as in the parameter files, with each trajectory's own |e| before the first step"  # what notebook 00 calls its main one
 TEMPLATE = PROJECT / "reports/template"
@@ -174,11 +174,11 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
                 figure.set_layout_engine("none")  # it stays as the first file was laid out: a layout costs as much as drawing
                 pixels = io.BytesIO()
                 figure.savefig(pixels)
-                palette = Image.open(pixels).convert("RGB").quantize(COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-                palette.save(partial / "figures" / f"{name}.png", optimize=True)
+                (partial / "figures" / f"{name}.png").write_bytes(smaller(pixels.getvalue()))
         for name, frame in tabulated.items():
             frame.to_csv(partial / "tables" / f"{name}.csv", index=False, float_format="%.10g")
-            (partial / "tables" / f"{name}.md").write_text(tables.to_markdown(frame) + "\n", encoding="utf-8")
+            if len(frame) <= LONGEST_TWIN:
+                (partial / "tables" / f"{name}.md").write_text(tables.to_markdown(frame) + "\n", encoding="utf-8")
         tabulated["comparison"].to_csv(partial / "comparison.csv", index=False, float_format="%.10g")
         results.seeds.to_csv(partial / "seeds.csv", index=False, float_format="%.10g")
         (partial / PROVENANCE).write_text(json.dumps(origin, indent=1) + "\n", encoding="utf-8")

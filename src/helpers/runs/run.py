@@ -1,6 +1,7 @@
 """One stage = one notebook, executed by papermill. `python -m helpers run --help` tells how."""
 
 import argparse
+import base64
 import os
 import re
 import shutil
@@ -21,6 +22,7 @@ from papermill.exceptions import PapermillExecutionError
 from traitlets.config import Config
 
 import helpers.runs.quick_start  # noqa: F401  (before nbformat)
+from helpers.runs.pictures import smaller
 from helpers.runs.request import SessionError, check_parameters, check_place
 from helpers.runs.scratch import beside, sweep
 from helpers.runs.sources import PROJECT
@@ -104,7 +106,7 @@ def _forget_finished(notebook: str, parameters: dict[str, Any]) -> None:
 
 
 def strip_machine(path: Path) -> None:
-    """Take papermill's paths and times out of an executed notebook, so that it can be compared and published."""
+    """Take papermill's paths and times out of an executed notebook, so that it can be compared and published; pictures shrink."""
     notebook = nbformat.read(path, as_version=4)
     for name in ("papermill", "widgets"):
         notebook.metadata.pop(name, None)
@@ -119,6 +121,8 @@ def strip_machine(path: Path) -> None:
         else:
             cell.metadata.pop("tags", None)
         for output in cell.get("outputs", []):
+            if picture := output.get("data", {}).get("image/png"):
+                output.data["image/png"] = base64.b64encode(smaller(base64.b64decode(picture))).decode() + "\n"
             if output.output_type == "stream":  # a warning names the file of a package
                 output.text = output.text.replace(f"{sysconfig.get_path('purelib')}/", "").replace(f"{PROJECT}/", "")
     nbformat.write(notebook, path)

@@ -208,7 +208,7 @@ def test_another_learning_rate_fails(tmp_path):
     (params / "learning.yaml").write_text(changed, encoding="utf-8")
     copy = Copy("02_offline_irl", tmp_path)
     copy.replace('params_root = ""', f"params_root = {str(params)!r}")
-    learning, _ = copy.cell("stages.imitate")
+    learning, _ = copy.cell("algorithm_1(learner")
     status, failed, said = copy.run()
     assert status == 1, said
     assert failed[0] == learning, said

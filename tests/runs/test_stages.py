@@ -88,6 +88,19 @@ def test_figures_of_merit_have_the_names_that_the_report_reads(learned):
     assert table["value"].map(lambda value: isinstance(value, (int, float))).all()
 
 
+def test_the_steps_that_notebook_02_shows_are_those_of_the_verb(learned):
+    """Its stored results come from the loop in its cell, maybe on another machine."""
+    run, _, offline, *_ = learned
+    stored = run.load("offline_improved", "02_offline_irl")
+    assert stored.table("weights.csv")["alpha"].tolist() == pytest.approx(offline.weights.tolist(), rel=1e-6)
+    history, own = stored.table("history.csv"), stages.history_table(offline.records, run.feature_names)
+    assert list(history) == list(own)
+    assert history.to_numpy() == pytest.approx(own.to_numpy(), rel=1e-6)
+    kept = stored.policy(run.params.learning, run.task).state_dict()
+    for name, parameter in offline.policy.state_dict().items():
+        torch.testing.assert_close(kept[name], parameter, rtol=1e-6, atol=1e-9)
+
+
 def test_records_of_learning_become_tables(learned):
     run, _, offline, online, _ = learned
     history = stages.history_table(offline.records, run.feature_names)

@@ -12,7 +12,7 @@ from torch import Tensor
 from helpers.learning.algorithm_1 import algorithm_1
 from helpers.learning.evaluation import feature_gap, relative_gap
 from helpers.learning.features import FeatureMap, linear_reward
-from helpers.learning.learner import Learner, TrainingError
+from helpers.learning.learner import EpochRecord, Learner, TrainingError
 from helpers.learning.policy import LSTMPolicy
 from helpers.plant.task import Trajectories
 from helpers.settings.paper import WeightParams
@@ -151,15 +151,16 @@ def algorithm_2(
         v = learner.expected_features(n_measured)  # Monte Carlo evaluation, Algorithm S1
         ascent.step(maxent_gradient(v_expert, v))  # Eq. 3.4.4-3.4.6
         kept.offer(learner, relative_gap(v, v_expert))
-        last = {name: getattr(epochs[-1], name) for name in ("mean_return", "learning_rate", "policy_std")}
-        spent = {name: getattr(learner, name) for name in ("epochs", "episodes", "gradient_steps")}
-        records.append(
-            IterationRecord(
-                iteration=len(records) + 1, feature_gap=feature_gap(v, v_expert), weights=tuple(alpha.tolist()), **spent, **last
-            )
-        )
+        records.append(iteration_record(len(records) + 1, learner, epochs[-1], alpha, feature_gap(v, v_expert)))
         watch(records[-1])
     return Apprenticeship(ascent.result, kept.policy, kept.epoch, tuple(records))
+
+
+def iteration_record(iteration: int, learner: Learner, epoch: EpochRecord, alpha: Tensor, gap: float) -> IterationRecord:
+    """What an outer iteration gave: its last epoch, the weights it was under, and the feature gap after it."""
+    last = {name: getattr(epoch, name) for name in ("mean_return", "learning_rate", "policy_std")}
+    spent = {name: getattr(learner, name) for name in ("epochs", "episodes", "gradient_steps")}
+    return IterationRecord(iteration=iteration, feature_gap=gap, weights=tuple(alpha.tolist()), **spent, **last)
 
 
 def shares(total: int, parts: int) -> list[int]:

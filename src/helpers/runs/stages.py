@@ -69,16 +69,17 @@ def load_policy(session: Session, stage: str, made_by: str, case: int | None = N
     return found.policy(session.params.learning, session.task), alpha
 
 
-def imitate(
+def apprentice(
     session: Session,
     demonstrations: Demonstrations,
     policy: LSTMPolicy,
     start: Tensor | None = None,
     features: FeatureMap | None = None,
-) -> Apprenticeship:
-    """Offline learning: Algorithm 2 from a policy and weights; without `start` the weights begin at their signs.
+) -> tuple[Learner, Tensor, Tensor, int]:
+    """What Algorithm 2 begins with: the learner, v_E, alpha before the first iteration, and the number of iterations.
 
-    A policy that was trained before gets its initial exploration back. `features`: those to match, if not the session's own.
+    Without `start` the weights begin at their signs. A policy that was trained before gets its initial exploration back.
+    `features`: those to match, if not the session's own.
     """
     variant, scale, offline = session.variant_params, session.scale_params, session.params.case.offline
     n_epochs = session.epochs(offline.epochs)
@@ -88,11 +89,23 @@ def imitate(
     policy.reset_exploration(variant.exploration)
     generator = session.stream("offline", session.params.base(session.variant))
     learner = Learner(policy, session.process, features or session.features, variant.learner, scale.episodes, n_epochs, generator)
-    v_expert = demonstrations.features(learner.features)
+    return learner, demonstrations.features(learner.features), start, n_iterations
+
+
+def imitate(
+    session: Session,
+    demonstrations: Demonstrations,
+    policy: LSTMPolicy,
+    start: Tensor | None = None,
+    features: FeatureMap | None = None,
+) -> Apprenticeship:
+    """Offline learning: Algorithm 2 from a policy and weights; see `apprentice`. Notebook 02 shows its steps."""
+    learner, v_expert, start, n_iterations = apprentice(session, demonstrations, policy, start, features)
+    params, measured = session.variant_params.weights, session.scale_params.measured
 
     def train() -> State:
-        bar = ProgressBar(n_epochs, "offline")
-        found = algorithm_2(learner, v_expert, start, variant.weights, n_iterations, scale.measured, bar)
+        bar = ProgressBar(learner.total_epochs, "offline")
+        found = algorithm_2(learner, v_expert, start, params, n_iterations, measured, bar)
         records = [asdict(record) for record in found.records]
         return {"weights": found.weights, "policy": found.policy.state_dict(), "epoch": found.chosen_epoch, "records": records}
 

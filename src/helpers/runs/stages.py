@@ -217,6 +217,22 @@ def judge_improvement(session: Session, trajectories: Trajectories, result: Impr
     return judge(session, trajectories) | cost(result.records[-1])
 
 
+def judge_online(
+    session: Session, offline: LSTMPolicy, results: Mapping[str, Improvement]
+) -> tuple[dict[str, Trajectories], dict[str, dict[str, float]]]:
+    """Trajectories and scores of PID, offline policy, the policies improved on x and on y, and minimum variance, by stage.
+
+    All meet the same disturbances.
+    """
+    learned = {"online": results["x"], "online_y": results["y"]}
+    controllers: dict[str, Controller] = {"expert_paired": session.expert, "offline": deploy(session, offline)}
+    controllers |= {name: deploy(session, result.policy) for name, result in learned.items()}
+    controllers["minimum_variance"] = session.minimum_variance
+    trajectories = {name: fresh_trajectories(session, controller) for name, controller in controllers.items()}
+    scores = {name: judge(session, batch) for name, batch in trajectories.items()}
+    return trajectories, scores | {name: judge_improvement(session, trajectories[name], result) for name, result in learned.items()}
+
+
 def cost(record: EpochRecord | IterationRecord) -> dict[str, float]:
     """What learning had cost by the end of a record."""
     return {name: float(getattr(record, name)) for name in ("epochs", "episodes", "gradient_steps")}

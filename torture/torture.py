@@ -26,7 +26,7 @@ CHAIN = tuple(
 REPORT = PROJECT / "reports/reference/reliability.md"
 WHOLE = "The smoke run of three case studies"
 PART = "A smoke run of notebooks 01, 02 and 04 (six stages)"
-PROPERTIES = PROJECT / "tests/test_properties.py"
+PROPERTIES = PROJECT / "tests/project/test_properties.py"
 TITLES = {
     "lost": "finished results damaged, gone or made again after a kill",
     "ending": "results made again because their stage was just ending",

@@ -386,7 +386,8 @@ def test_what_is_stale_is_run_again_with_all_that_read_it(finished, changed, old
     path.write_text(edited(before, old, new), encoding="utf-8")
     assert finished() == jobs
     path.write_text(before, encoding="utf-8")
-    assert finished() == {}  # whatever the times of the files
+    if not changed.startswith("reports/template"):  # of which Snakemake looks at the time
+        assert finished() == {}  # whatever the times of the files
 
 
 @pytest.mark.torture

@@ -184,6 +184,6 @@ def test_a_rerun_is_bit_equal(learned):
 def test_a_rerun_with_another_number_of_threads_is_bit_equal(learned):
     """Other processes, whatever their environment says: the scale sets the threads."""
     environment = os.environ | {"OMP_NUM_THREADS": "2", "MKL_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2", "TQDM_DISABLE": "1"}
-    command = [sys.executable, "-c", "import test_stages; print(test_stages.learn()[-1])"]
-    done = subprocess.run(command, cwd=PROJECT / "tests", env=environment, capture_output=True, text=True, check=True)
+    command = [sys.executable, "-c", "from tests.runs import test_stages; print(test_stages.learn()[-1])"]
+    done = subprocess.run(command, cwd=PROJECT, env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == learned[-1]

@@ -108,6 +108,7 @@ def quick_root(root, tmp_path):
     return folder
 
 
+@pytest.mark.torture
 def test_the_command_goes_from_a_file_to_a_controller_and_a_report(tmp_path, quick_root, capsys):
     path = MadeUpPlant(3, 2).write(tmp_path)
     arguments = [str(path), "--output", str(tmp_path / "out"), "--scale", "smoke", "--params", str(quick_root)]

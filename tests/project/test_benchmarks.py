@@ -193,6 +193,7 @@ def written(tmp_path_factory):
     return out
 
 
+@pytest.mark.torture
 def test_peak_memory_is_that_of_learning_alone():
     """Without the hundreds of MB that Python and torch take."""
     assert 0 <= benchmark.peak_memory([(12, 4)])[12, 4] < 50

@@ -27,6 +27,7 @@ def seen(*prefix):
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.torture
 def test_an_older_processor_has_less_and_computes_the_same_but_for_rounding():
     older = seen(sys.executable, "-m", "torture.processors", "older", "--")
     assert older["torch"] == "DEFAULT"

@@ -173,10 +173,13 @@ def test_control_figure_names_panels_variables_units_and_all_that_is_drawn(n_loo
         assert part in shown
 
 
-KINDS = [pytest.param(kind, marks=pytest.mark.torture) for kind in ("tracking", "online", "budget", "mdp", "framework", "network")]
+KINDS = [
+    pytest.param(kind, marks=pytest.mark.torture)
+    for kind in ("seeds", "curves", "tracking", "online", "budget", "mdp", "framework", "network")
+]
 
 
-@pytest.mark.parametrize("kind", ["control", "curves", "seeds", *KINDS])
+@pytest.mark.parametrize("kind", ["control", *KINDS])
 def test_nothing_is_cut_off_and_no_panels_overlap(kind: str) -> None:
     figure = {
         "control": lambda: draw(3),
@@ -235,6 +238,7 @@ def several(table: pd.DataFrame, columns: list[str], n_seeds: int = 4) -> pd.Dat
     return pd.concat(frames, ignore_index=True)
 
 
+@pytest.mark.torture
 def test_several_seeds_are_thin_lines_about_their_median() -> None:
     table = response()
     figure = draw(2, several(table, ["mean", "std"]))

@@ -93,6 +93,7 @@ def test_one_seed_shows_its_monte_carlo_interval(results):
     assert found["limits_safety"].set_index(["case", "controller"]).loc[("I", "hot start"), "Worst episode ($J$)"] == "10.0"
 
 
+@pytest.mark.torture
 def test_several_seeds_show_medians(results):
     found = limits_report.tabulate(results(3))
     assert found["limits_gaps"].set_index("controller").loc["offset-free MPC"].tolist() == ["11.0", "21.0"]
@@ -117,6 +118,7 @@ def test_what_a_seed_never_reached_counts_as_long(times, shown):
     assert table["Rise 10-90 %, $T^*$ (time)"].tolist() == [shown]
 
 
+@pytest.mark.torture
 def test_the_papers_way_beside_its_rivals(results):
     budget = limits_report.tabulate(results(3))["limits_budget"].set_index(["case", "controller"])
     assert budget.loc[("I", "PPO from scratch"), "least to greatest at the end"] == "10.00 to 12.00"

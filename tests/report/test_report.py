@@ -309,6 +309,7 @@ def test_what_went_well_is_said_where_the_limits_were_not_run(results, monkeypat
     assert "It has its price" not in text
 
 
+@pytest.mark.torture
 def test_claims_trials_and_budget_appear_where_they_were_run(results, several):
     trial = next(iter(results.params[1].trials))
     assert not {"claims", "trials"} & report.tabulate(results).keys()
@@ -406,6 +407,7 @@ def test_limits_of_other_inputs_are_refused_and_a_part_alone_is_none(own):
     assert f"{path} (changed: params/learning.yaml)" in refusal(own)
 
 
+@pytest.mark.torture
 def test_seeds_with_missing_stages_are_left_out_only_when_asked_and_the_report_says_so(several, tmp_path):
     shutil.rmtree(several / "smoke/seed_2/case_3/transfer_improved")
     with pytest.raises(ArtifactError, match="seed_2/case_3/transfer_improved"):

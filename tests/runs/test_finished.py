@@ -55,8 +55,9 @@ def assert_equal(found, expected):
     assert all(left.dtype == right.dtype and torch.equal(left, right) for left, right in zip(found[2], expected[2], strict=True))
 
 
-LEARNING = [(offline, "improved", "float32"), (offline, "printed", "float64"), (online, "improved", "float32")]
-LEARNING += [(frozen, "improved", "float32"), (budgeted, "improved", "float32")]
+MORE = [(online, "improved", "float32"), (frozen, "improved", "float32"), (budgeted, "improved", "float32")]
+LEARNING = [(offline, "improved", "float32"), (offline, "printed", "float64")]
+LEARNING += [pytest.param(*case, marks=pytest.mark.torture) for case in MORE]
 
 
 @pytest.mark.parametrize(("learn", "variant", "dtype"), LEARNING)

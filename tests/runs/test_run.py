@@ -288,9 +288,13 @@ ONLINE = {rule: count for rule, count in ONE_SEED.items() if rule not in ("demon
 STAGE = "results/smoke/seed_0/case_{}/{}/record.json"
 
 
-def test_the_whole_run_is_fourteen_jobs_with_all_and_each_seed_repeats_its_stages(plan):
+def test_the_whole_run_is_fourteen_jobs_with_all(plan):
     assert plan() == ONE_SEED
     assert sum(ONE_SEED.values()) + 1 == 14
+
+
+@SLOW
+def test_each_seed_repeats_the_stages(plan):
     assert plan(seeds=2) == {rule: count if rule == "report" else 2 * count for rule, count in ONE_SEED.items()}
 
 

@@ -140,6 +140,9 @@ def _gap(values: Tensor, best: Tensor) -> dict[str, float]:
     return {"gap": 100 * (1 - share), "gap_low": 100 * (1 - share - reach), "gap_high": 100 * (1 - share + reach)}
 
 
+# Control quality -----------------------------------------------------------------------------------------------------
+
+
 def control_quality(contest: Contest, builds: Mapping[str, Build], stationary: Mapping[str, Build]) -> pd.DataFrame:
     """The scorecard: `quality` of every controller, and the Harris index of each loop from a long run at the set point.
 

@@ -44,16 +44,3 @@ class Adam:
         if held:
             parameters, gradients, means, squares, counts = (list(column) for column in zip(*held, strict=True))
             adam(parameters, gradients, means, squares, [], counts, lr=self.param_groups[0]["lr"], **DEFAULTS)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Rate and moments, in the structure of torch's own optimisers."""
-        names = ("exp_avg", "exp_avg_sq", "step")
-        return {
-            "state": {index: dict(zip(names, entry, strict=True)) for index, entry in enumerate(self.state)},
-            "param_groups": self.param_groups,
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what another optimiser of the same parameters gave."""
-        self.state = [tuple(part.clone() for part in state["state"][index].values()) for index in range(len(self.parameters))]
-        self.param_groups = [dict(group) for group in state["param_groups"]]

@@ -1,7 +1,9 @@
-"""A linear state-space model with disturbance and noise, identified from the records of a plant by maximum likelihood.
+"""A model of a plant from its records, with its order, its dead times and its uncertainty.
 
-The likelihood is that of statsmodels' Kalman filter. A likelihood of one-step predictions stays consistent on records of a plant
-under feedback, where subspace and correlation methods do not (Ljung 1999, Section 13.4).
+Each output has an equation of its own: A(q) y_t = sum_j B_j(q) u_j,t-1-d_j + c + C(q) e_t, an ARMAX model with a dead time for
+each input. Its parameters minimise the one-step prediction errors (Ljung 1999, Sections 7.2 and 10.2), which stays consistent
+on records of a plant under feedback, where correlations of input and output do not. Order and dead times are those with the
+greatest likelihood on records held out. The uncertainty is an ensemble: the same equation on reweighted blocks of the record.
 """
 
 from collections.abc import Sequence
@@ -11,135 +13,78 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.signal import lfilter
 from statsmodels.stats.diagnostic import acorr_ljungbox
-from statsmodels.tsa.statespace.mlemodel import MLEModel
 
 from helpers.own_plant.episodes import Stretch
-from helpers.own_plant.model import LinearModel
-from helpers.own_plant.settings import PlantIdentificationParams
+from helpers.own_plant.model import ArmaxModel
+from helpers.own_plant.settings import MarginParams, PlantIdentificationParams
 from helpers.settings.leaf import InputError
 
 Array = NDArray[np.float64]
-DIFFUSE = 1e2  # variance of the first state of a stretch, in squared units of the scaled outputs
-
-
-class VectorARX(MLEModel):
-    """z_{t+1} = sum_i A_i z_{t+1-i} + sum_i B_i u_{t+1-i} + c + w_t, y_t = z_t + v_t over stretches apart from each other.
-
-    Scaled signals. The parameters are A_1..A_p, B_1..B_p, c and the square roots of the variances of w and v. At the
-    end of a stretch the state is forgotten.
-
-    Args:
-        lags: p. y, u: all stretches after each other, (n, n_y) and (n, n_u). last: True at the last sample of a stretch.
-    """
-
-    def __init__(self, y: Array, u: Array, last: NDArray[np.bool_], lags: int) -> None:
-        self.n_y, self.n_u, self.lags, self.last = y.shape[1], u.shape[1], lags, last
-        n_states = self.n_y * lags
-        super().__init__(y, k_states=n_states, k_posdef=n_states)
-        first = np.roll(last, 1)
-        since = np.arange(len(y)) - np.maximum.accumulate(np.where(first, np.arange(len(y)), 0))
-        # An input from before the stretch is not known; the first one stands for it.
-        self.inputs = np.hstack([u[np.arange(len(u)) - np.minimum(lag, since)] for lag in range(lags)])
-        self.ssm["design"] = np.eye(self.n_y, n_states)
-        self.ssm["selection"] = np.eye(n_states)
-        self.forget = DIFFUSE * np.eye(n_states)
-        self.ssm.initialize_known(np.zeros(n_states), self.forget)
-        self.ssm["transition"] = np.zeros((n_states, n_states, len(y)))
-        self.ssm["state_intercept"] = np.zeros((n_states, len(y)))
-        self.ssm["state_cov"] = np.zeros((n_states, n_states, len(y)))
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """How many parameters A, B, c, w and v have."""
-        return self.n_y**2 * self.lags, self.n_y * self.n_u * self.lags, self.n_y, self.n_y, self.n_y
-
-    def split(self, params: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """A (n_y, n_y p), B (n_y, n_u p), c, w and v, each (n_y,)."""
-        a, b, c, w, v = np.split(params, np.cumsum(self.sizes)[:-1])
-        return a.reshape(self.n_y, -1), b.reshape(self.n_y, -1), c, w, v
-
-    def least_squares(self) -> Array:
-        """First parameters: least squares on the outputs as they are, most of what is left taken for disturbance."""
-        y = np.asarray(self.endog)
-        usable = np.flatnonzero(~self.last[:-1])
-        for lag in range(1, self.lags):
-            usable = usable[usable >= lag]
-            usable = usable[~self.last[usable - lag]]
-        past = np.hstack([*(y[usable - lag] for lag in range(self.lags)), self.inputs[usable], np.ones((len(usable), 1))])
-        known = np.isfinite(past).all(1) & np.isfinite(y[usable + 1]).all(1)
-        solution, *_ = np.linalg.lstsq(past[known], y[usable + 1][known], rcond=None)
-        left = (y[usable + 1][known] - past[known] @ solution).std(0)
-        n_a = self.n_y * self.lags
-        return np.concatenate([solution[:n_a].T.ravel(), solution[n_a:-1].T.ravel(), solution[-1], 0.9 * left, 0.3 * left])
-
-    def update(self, params: Array, **kwargs: object) -> None:
-        """Put the parameters into the matrices of the filter."""
-        a, b, c, w, v = self.split(np.asarray(params))
-        n_y, keep = self.n_y, ~self.last
-        transition = np.vstack([a, np.eye(n_y * (self.lags - 1), n_y * self.lags)])
-        covariance = np.zeros((len(transition), len(transition)))
-        covariance[:n_y, :n_y] = np.diag(w**2)
-        intercept = np.zeros((len(transition), len(keep)))
-        intercept[:n_y] = (b @ self.inputs.T + c[:, None]) * keep
-        self.ssm["transition"] = transition[..., None] * keep
-        self.ssm["state_intercept"] = intercept
-        self.ssm["state_cov"] = np.where(keep, covariance[..., None], self.forget[..., None])
-        self.ssm["obs_cov"] = np.diag(v**2)
-
-    def expectation_maximisation(self, params: Array) -> tuple[Array, float, Array]:
-        """One step of the EM algorithm (Shumway and Stoffer 1982): it never lowers the likelihood.
-
-        Returns:
-            The next parameters, the log-likelihood of the given ones, and the standard errors of A, B and c, as if the
-            states were known as well as the smoother knows them, shape (n_y, n_y p + n_u p + 1).
-        """
-        self.update(params)
-        found = self.ssm.smooth()
-        n_y, keep = self.n_y, np.flatnonzero(~self.last)
-        keep = keep[keep < len(self.last) - 1]
-        mean, cov, lagged = found.smoothed_state, found.smoothed_state_cov, found.smoothed_state_autocov
-        known = np.vstack([self.inputs[keep].T, np.ones((1, len(keep)))])
-        regressor = np.vstack([mean[:, keep], known])
-        n_states, n_regressors = len(mean), len(regressor)
-        gram = regressor @ regressor.T
-        gram[:n_states, :n_states] += cov[..., keep].sum(-1)
-        target = mean[:n_y, keep + 1]
-        cross = target @ regressor.T
-        cross[:, :n_states] += lagged[..., keep].sum(-1)[:n_y]
-        solution = np.linalg.solve(gram, cross.T).T
-        square = (target**2).sum(1) + np.einsum("iit->i", cov[:n_y, :n_y][..., keep + 1])
-        w = np.sqrt(np.maximum(square - (solution * cross).sum(1), 0) / len(keep))
-        y = np.asarray(self.endog)
-        seen = np.isfinite(y)
-        spread = np.einsum("iit->ti", cov[:n_y, :n_y])
-        v = np.sqrt(np.where(seen, (np.nan_to_num(y) - mean[:n_y].T) ** 2 + spread, 0).sum(0) / seen.sum(0))
-        errors = w[:, None] * np.sqrt(np.diag(np.linalg.inv(gram)))[None, :]
-        n_a, n_b = n_y * self.lags, self.n_u * self.lags
-        after = np.concatenate([solution[:, :n_a].ravel(), solution[:, n_a : n_a + n_b].ravel(), solution[:, -1], w, v])
-        return after, float(found.llf), errors.reshape(n_y, n_regressors)
+BLOCK = 50  # samples that are drawn together into a member of the ensemble
+STEPS, RESTARTS = 12, 2  # Gauss-Newton steps of a fit and of one member of the ensemble
+LONG = 12  # lags of the autoregression whose residuals stand for the innovations at the start
+TOLD = 4.0  # standard errors from zero
+FARTHEST = 0.98  # modulus of a zero of C: beyond it the filter 1/C would remember for longer than a record
 
 
 @dataclass(frozen=True)
-class Identified:
-    """A model and how it came about.
+class Structure:
+    """What an equation looks like: its order n, the dead time of each input in samples, and whether it has a pole at one."""
+
+    order: int
+    dead_times: tuple[int, ...]
+    integrating: bool = False
+
+    @property
+    def n_own(self) -> int:
+        """How many coefficients of A are free."""
+        return self.order - self.integrating
+
+
+@dataclass(frozen=True)
+class Equation:
+    """One output of a plant, fitted; scaled signals.
 
     Attributes:
-        scales: of outputs and inputs, in whose units the likelihood was computed.
-        lags: those chosen. criteria: Schwarz's information criterion of each number of lags tried.
-        parameters, errors: A, B and c in scaled units, a row for each output, and their standard errors.
-        warnings: what the data cannot carry, in sentences.
+        parameters: the free coefficients of A, those of B input by input, c, and those of C.
+        spread: of the innovations, (2,): fixed, and the part that grows with the deviation of the output.
     """
 
-    model: LinearModel
-    scales: tuple[Array, Array]
-    lags: int
-    criteria: dict[int, float]
+    structure: Structure
     parameters: Array
-    vector: Array
-    errors: Array
-    n_samples: int
-    warnings: tuple[str, ...]
+    spread: Array
+
+    @property
+    def own(self) -> Array:
+        """a_1..a_n of y_t = a_1 y_{t-1} + .., the pole at one included, shape (n,)."""
+        free = self.parameters[: self.structure.n_own]
+        if not self.structure.integrating:
+            return free
+        return -np.convolve([1.0, -1.0], np.concatenate([[1.0], -free]))[1:]
+
+    @property
+    def inputs(self) -> Array:
+        """b_1..b_n of each input after its dead time, shape (n_u, n)."""
+        n, n_u = self.structure.order, len(self.structure.dead_times)
+        return self.parameters[self.structure.n_own :][: n * n_u].reshape(n_u, n)
+
+    @property
+    def constant(self) -> float:
+        """c."""
+        return float(self.parameters[-1 - self.structure.order])
+
+    @property
+    def innovations(self) -> Array:
+        """c_1..c_n of C(q) = 1 + c_1 q^-1 + .., shape (n,)."""
+        return self.parameters[-self.structure.order :]
+
+    @property
+    def growth(self) -> float:
+        """The largest modulus among the free poles."""
+        free = self.parameters[: self.structure.n_own]
+        return float(np.abs(np.roots(np.concatenate([[1.0], -free]))).max(initial=0.0))
 
 
 def hold_out(pieces: Sequence[Stretch], share: float) -> tuple[list[Stretch], list[Stretch]]:
@@ -168,101 +113,372 @@ def thin_out(pieces: Sequence[Stretch], longest: int, length: int) -> list[Stret
     return [cut[int(index)] for index in np.linspace(0, len(cut) - 1, max(1, longest // length))]
 
 
-def _model_of(pieces: Sequence[Stretch], scales: tuple[Array, Array], lags: int) -> VectorARX:
-    last = np.concatenate([np.arange(len(piece)) == len(piece) - 1 for piece in pieces])
-    y, u = (np.concatenate([getattr(piece, name) for piece in pieces]) / scale for name, scale in zip("yu", scales, strict=True))
-    return VectorARX(y, u, last, lags)
+def lagged(signal: Array, lag: int) -> Array:
+    """A signal some samples ago; before the record its first value stands for what is not known."""
+    return signal[np.maximum(np.arange(len(signal)) - lag, 0)]
+
+
+def stable_zeros(coefficients: Array) -> Array:
+    """C(q) with its zeros inside the unit circle: those outside are mirrored, which leaves the spectrum as it was."""
+    roots = np.roots(np.concatenate([[1.0], coefficients]))
+    size = np.abs(roots)
+    inside = np.where(size > 1, roots / np.maximum(size, 1e-12) ** 2, roots)
+    inside = inside * np.minimum(1, FARTHEST / np.maximum(np.abs(inside), 1e-12))
+    polynomial = np.real(np.poly(inside))[1:]
+    return np.concatenate([polynomial, np.zeros(len(coefficients) - len(polynomial))])
+
+
+class Record:
+    """All stretches of a record for one output, scaled: what is regressed on what, for every structure.
+
+    Args:
+        pieces: y (n,) and u (n, n_u) of each stretch. first: the sample of a stretch from which on everything that any structure
+            looks back at is known; shorter stretches are left out.
+    """
+
+    def __init__(self, pieces: Sequence[tuple[Array, Array]], first: int) -> None:
+        self.first = max(first, LONG)
+        self.pieces = [piece for piece in pieces if len(piece[0]) > 2 * self.first]
+        self.length = sum(len(piece[0]) - self.first for piece in self.pieces)
+
+    def regression(self, structure: Structure) -> list[tuple[Array, Array]]:
+        """Target (n,) and regressors (n, p) of each stretch: own past, inputs, and one."""
+        found, first = [], self.first
+        for y, u in self.pieces:
+            signal = np.diff(y, prepend=y[:1]) if structure.integrating else y
+            past = [lagged(signal, lag) for lag in range(1, structure.n_own + 1)]
+            moved = [
+                lagged(u[:, j], 1 + dead + lag) for j, dead in enumerate(structure.dead_times) for lag in range(structure.order)
+            ]
+            found.append((signal[first:], np.column_stack([*past, *moved, np.ones(len(y))])[first:]))
+        return found
+
+    def errors(self, structure: Structure, parameters: Array) -> list[Array]:
+        """One-step prediction errors of each stretch; the first ones of a stretch start from innovations of zero."""
+        n = structure.order
+        linear, c = parameters[:-n], np.concatenate([[1.0], parameters[-n:]])
+        return [lfilter([1.0], c, target - past @ linear) for target, past in self.regression(structure)]
+
+    def starts(self, structure: Structure) -> list[Array]:
+        """First parameters: after Hannan and Rissanen (1982), with the residuals of a long autoregression as innovations; then with
+        all that is left taken for noise of the sensor, C = A; then for disturbance, C = 1.
+        """
+        regression, n = self.regression(structure), structure.order
+        long = self.regression(Structure(LONG, structure.dead_times, structure.integrating))
+        coefficients = _least_squares(long)
+        rows = []
+        for (target, past), (late, far) in zip(regression, long, strict=True):
+            e = late - far @ coefficients
+            rows.append((target, np.column_stack([past, *(_before(e, lag) for lag in range(1, n + 1))])))
+        first = _least_squares(rows)
+        plain = _least_squares(regression)
+        own = Equation(structure, np.concatenate([plain, np.zeros(n)]), np.ones(2)).own
+        found = [first, np.concatenate([plain, -own]), np.concatenate([plain, np.zeros(n)])]
+        for parameters in found:
+            parameters[-n:] = stable_zeros(parameters[-n:])
+        return found
+
+    def fit(self, structure: Structure, start: Array | None = None, weights: Array | None = None, steps: int = STEPS) -> Array:
+        """The parameters with the least weighted sum of squared prediction errors, by Gauss-Newton with halved steps."""
+        if start is None:
+            fits = [self.fit(structure, first, weights, steps) for first in self.starts(structure)]
+            return min(fits, key=lambda found: sum(float((e**2).sum()) for e in self.errors(structure, found)))
+        parameters = start
+        n = structure.order
+        root = np.ones(self.length) if weights is None else weights**0.5
+        best = self._cost(structure, parameters, root)
+        for _ in range(steps):
+            errors, slopes = self.linearised(structure, parameters)
+            step = _solve(root[:, None] * slopes, root * errors)
+            share = 1.0
+            while share > 1e-2:
+                trial = parameters + share * step
+                trial[-n:] = stable_zeros(trial[-n:])
+                cost = self._cost(structure, trial, root)
+                if cost < best:
+                    break
+                share /= 2
+            else:
+                break
+            gained, best, parameters = best - cost, cost, trial
+            if gained < 1e-6 * best:
+                break
+        return parameters
+
+    def linearised(self, structure: Structure, parameters: Array) -> tuple[Array, Array]:
+        """All one-step errors, (N,), and their slopes in the parameters with the sign changed, (N, p)."""
+        n = structure.order
+        linear, c = parameters[:-n], np.concatenate([[1.0], parameters[-n:]])
+        errors, slopes = [], []
+        for target, past in self.regression(structure):
+            e = lfilter([1.0], c, target - past @ linear)
+            errors.append(e)
+            tail = [_before(e, lag) for lag in range(1, n + 1)]
+            slopes.append(lfilter([1.0], c, np.column_stack([past, *tail]), axis=0))
+        return np.concatenate(errors), np.concatenate(slopes)
+
+    def _cost(self, structure: Structure, parameters: Array, root: Array) -> float:
+        return float(((root * np.concatenate(self.errors(structure, parameters))) ** 2).sum())
+
+
+def _before(e: Array, lag: int) -> Array:
+    return np.concatenate([np.zeros(lag), e])[: len(e)]
+
+
+def _least_squares(rows: Sequence[tuple[Array, Array]]) -> Array:
+    target, past = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    return _solve(past, target)
+
+
+def _solve(past: Array, target: Array) -> Array:
+    """Least squares by the normal equations of scaled columns: many rows and few columns, ten times as fast as by an orthogonal basis."""
+    size = np.sqrt((past**2).sum(0)) + 1e-12
+    scaled = past / size
+    return np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(len(size)), scaled.T @ target) / size
+
+
+def likelihood(errors: Sequence[Array], variance: float) -> Array:
+    """Log density of one-step errors, (N,), normal with this variance."""
+    e = np.concatenate(errors)
+    return -(e**2 / variance + np.log(2 * np.pi * variance)) / 2
+
+
+def dead_times(record: Record, order: int, integrating: bool, start: tuple[int, ...], longest: int) -> tuple[int, ...]:
+    """The dead times with the least squared errors, input by input until none changes."""
+    found = start
+    known: dict[tuple[int, ...], float] = {}
+
+    def cost(trial: tuple[int, ...]) -> float:
+        if trial not in known:
+            structure = Structure(order, trial, integrating)
+            known[trial] = float(sum((e**2).sum() for e in record.errors(structure, record.fit(structure, steps=2))))
+        return known[trial]
+
+    while True:
+        before = found
+        for j in range(len(found)):
+            found = min(((*found[:j], dead, *found[j + 1 :]) for dead in range(longest + 1)), key=cost)
+        if found == before:
+            return found
+
+
+def choose(training: Record, held_out: Record, n_inputs: int, params: PlantIdentificationParams) -> tuple[Structure, dict[Structure, float]]:
+    """The simplest structure whose likelihood on held-out records is within one standard error of the greatest.
+
+    Of those the simplest with white residuals, if there is one.
+
+    Returns:
+        It, and the mean log likelihood per sample of every candidate.
+    """
+    values: dict[Structure, Array] = {}
+    for integrating in (False, True):
+        dead: tuple[int, ...] = (0,) * n_inputs
+        for order in params.orders:
+            dead = dead_times(training, order, integrating, dead, params.longest_dead_time)
+            structure = Structure(order, dead, integrating)
+            fitted = training.fit(structure)
+            if Equation(structure, fitted, np.ones(2)).growth < 1:  # nothing is learned on an unstable model
+                variance = float(np.mean(np.concatenate(training.errors(structure, fitted)) ** 2))
+                values[structure] = likelihood(held_out.errors(structure, fitted), variance)
+    if not values:
+        raise InputError("no stable model describes the record")
+    best = max(values.values(), key=lambda value: float(value.mean()))
+
+    def good(value: Array) -> bool:
+        lost = best - value
+        return bool(lost.mean() <= lost.std() / len(lost) ** 0.5)
+
+    fine = sorted((s for s, value in values.items() if good(value)), key=lambda s: s.n_own + s.order)
+    fine = [s for s in fine if not s.integrating or ramps(training, s)] or [max(values, key=lambda s: float(values[s].mean()))]
+    white = [s for s in fine if whiteness(training.errors(s, training.fit(s)), params) >= params.white]
+    return (white or fine)[0], {s: float(value.mean()) for s, value in values.items()}
+
+
+def whiteness(errors: Sequence[Array], params: PlantIdentificationParams) -> float:
+    """The p-value of Ljung and Box for residuals."""
+    return float(acorr_ljungbox(np.concatenate(errors), [params.white_lags])["lb_pvalue"].iloc[0])
+
+
+def ramps(record: Record, structure: Structure) -> bool:
+    """Whether some input sets the rate of an integrating output: the sum of its coefficients is no chance."""
+    parameters = record.fit(structure)
+    errors, slopes = record.linearised(structure, parameters)
+    covariance = np.var(errors) * np.linalg.pinv(slopes.T @ slopes)
+    n = structure.order
+    first = [structure.n_own + n * j for j in range(len(structure.dead_times))]
+    ratios = [parameters[k : k + n].sum() / covariance[k : k + n, k : k + n].sum() ** 0.5 for k in first]
+    return max(np.abs(ratios)) > TOLD
+
+
+@dataclass(frozen=True)
+class Margins:
+    """How far a plant may be from its model beyond what the record cannot tell: factors of the gain of each input, (n_u,), and of
+    the time constants, and further samples of dead time of each input.
+    """
+
+    gain: Array
+    time: float
+    dead_time: tuple[int, ...]
+
+    @classmethod
+    def draw(cls, params: MarginParams, n_inputs: int, rng: np.random.Generator) -> "Margins":
+        """Evenly within the declared margins."""
+        more = tuple(int(number) for number in rng.integers(0, params.dead_time + 1, n_inputs))
+        return cls(1 + params.gain * rng.uniform(-1, 1, n_inputs), 1 + params.time * rng.uniform(-1, 1), more)
+
+
+def slowed(coefficients: Array, time: float) -> Array:
+    """The polynomial 1 - a_1 q^-1 - .. with every time constant multiplied: its roots to the power of 1/time.
+
+    Roots on the negative axis belong to no time constant and stay.
+    """
+    roots = np.roots(np.concatenate([[1.0], -coefficients])).astype(complex)
+    moved = np.where((np.abs(roots.imag) > 1e-9) | (roots.real > 0), roots ** (1 / time), roots)
+    polynomial = -np.real(np.poly(moved))[1:]
+    return np.concatenate([polynomial, np.zeros(len(coefficients) - len(polynomial))])
+
+
+def apart(equation: Equation, margins: Margins) -> Equation:
+    """The equation of a plant that is as far from the identified one as the margins say."""
+    structure, n = equation.structure, equation.structure.order
+    free = equation.parameters[: structure.n_own]
+    own = slowed(free, margins.time)
+    speed = (1 - own.sum()) / (1 - free.sum())
+    inputs = equation.inputs * speed * margins.gain[:, None]
+    zeros = -slowed(-equation.innovations, margins.time)
+    dead = tuple(known + more for known, more in zip(structure.dead_times, margins.dead_time, strict=True))
+    parameters = np.concatenate([own, inputs.ravel(), [equation.constant * speed], zeros])
+    return Equation(Structure(n, dead, structure.integrating), parameters, equation.spread)
+
+
+def assemble(plants: Sequence[Sequence[Equation]], scales: tuple[Array, Array]) -> ArmaxModel:
+    """Models side by side, each from the equations of its outputs, in deviation variables."""
+    y_scale, u_scale = scales
+    n_y, n_u = len(y_scale), len(u_scale)
+    lags = max(equation.structure.order for plant in plants for equation in plant)
+    taps = max(equation.structure.order + max(equation.structure.dead_times) for plant in plants for equation in plant)
+    own, innovations = np.zeros((2, len(plants), n_y, lags, n_y))
+    inputs = np.zeros((len(plants), n_y, taps, n_u))
+    constant, spread = np.zeros((len(plants), n_y)), np.zeros((len(plants), n_y, 2))
+    for m, plant in enumerate(plants):
+        for i, equation in enumerate(plant):
+            n = equation.structure.order
+            own[m, i, :n, i], innovations[m, i, :n, i] = equation.own, equation.innovations
+            for j, dead in enumerate(equation.structure.dead_times):
+                inputs[m, i, dead : dead + n, j] = equation.inputs[j] * y_scale[i] / u_scale[j]
+            constant[m, i] = equation.constant * y_scale[i]
+            spread[m, i] = equation.spread * (y_scale[i], 1.0)
+    flat = [array.reshape(len(plants), n_y, -1) for array in (own, inputs[:, :, 1:], innovations)]
+    return ArmaxModel(
+        window=torch.tensor(np.concatenate(flat, axis=-1)),
+        entry=torch.tensor(inputs[:, :, 0]),
+        constant=torch.tensor(constant),
+        spread=torch.tensor(spread),
+        lags=lags,
+        taps=taps,
+    )
+
+
+@dataclass(frozen=True)
+class Identified:
+    """A model and how it came about.
+
+    Attributes:
+        equations: the fitted equation of each output. nominal: the model of them. members: the equations of each member of the ensemble.
+        scales: of outputs and inputs, in whose units the equations stand.
+        candidates: of each output, the mean log likelihood per held-out sample by structure.
+        warnings: what the data cannot carry, in sentences.
+    """
+
+    equations: tuple[Equation, ...]
+    nominal: ArmaxModel
+    members: tuple[tuple[Equation, ...], ...]
+    scales: tuple[Array, Array]
+    candidates: tuple[dict[Structure, float], ...]
+    warnings: tuple[str, ...]
+
+    def ensemble(self, margins: MarginParams, n_models: int, seed: int) -> ArmaxModel:
+        """Models drawn from the members, each as far off as the margins allow."""
+        rng = np.random.default_rng(seed)
+        drawn = rng.integers(0, len(self.members), n_models)
+        n_u = len(self.scales[1])
+        chosen = [(self.members[index], Margins.draw(margins, n_u, rng)) for index in drawn]
+        return assemble([[apart(equation, margin) for equation in member] for member, margin in chosen], self.scales)
+
+
+def spread_of(record: Record, structure: Structure, parameters: Array) -> Array:
+    """How the standard deviation of the innovations grows with the deviation, (2,): s^2 = fixed^2 + (gain y)^2.
+
+    Least squares on the squared errors with both parts at least zero, weighted once by what the first pass found.
+    """
+    errors = np.concatenate(record.errors(structure, parameters))
+    level = np.concatenate([y[record.first :] for y, _ in record.pieces]) - errors
+    design, square, fitted = np.column_stack([np.ones_like(level), level**2]), errors**2, np.ones_like(level)
+    for _ in range(2):
+        solution, _ = nnls(design / fitted[:, None], square / fitted)
+        fitted = np.maximum(design @ solution, 0.05 * square.mean())
+    return np.sqrt(solution)
 
 
 def identify(
-    pieces: Sequence[Stretch], scales: tuple[Array, Array], names: tuple[Sequence[str], Sequence[str]],
-    params: PlantIdentificationParams, iterations: int,
+    training: Sequence[Stretch], held_out: Sequence[Stretch], scales: tuple[Array, Array], names: tuple[Sequence[str], Sequence[str]],
+    params: PlantIdentificationParams, members: int, seed: int,
 ) -> Identified:  # fmt: skip
-    """The most likely model of each number of lags, and of them the one with the least information criterion.
+    """Structure by records held out, then parameters and ensemble from all of them.
 
     Args:
-        pieces: deviation variables. scales: what counts as much in outputs (n_y,) and inputs (n_u,).
-        names: of outputs and inputs, for the warnings. iterations: of the EM algorithm.
+        training, held_out: deviation variables. scales: what counts as much in outputs (n_y,) and inputs (n_u,).
+        names: of outputs and inputs, for the warnings. members: of the ensemble.
+
+    Raises:
+        InputError: if no stretch is long enough, or no stable model describes the record.
     """
-    fits = {}
-    n_samples = sum(len(piece) for piece in pieces)
-    for lags in params.lags:
-        likelihood = _model_of(pieces, scales, lags)
-        vector = likelihood.least_squares()
-        for _ in range(iterations):
-            vector, value, errors = likelihood.expectation_maximisation(vector)
-        fits[lags] = (len(vector) * np.log(n_samples) - 2 * value, vector, errors, likelihood)
-    lags = min(fits, key=lambda number: float(fits[number][0]))
-    _, vector, errors, likelihood = fits[lags]
-    a, b, c, _, _ = likelihood.split(vector)
-    model = _state_space(likelihood, vector, scales, spread_of(likelihood, vector))
-    warnings = []
-    largest = float(np.abs(np.linalg.eigvals(model.state_step.numpy())).max())
-    if largest >= 1:
-        warnings.append(f"the model is not stable: its largest eigenvalue is {largest:.3f}")
-    told = np.abs(b) > 2 * errors[:, a.shape[1] : -1]
-    for index, name in enumerate(names[1]):
-        if not told[:, index :: len(names[1])].any():
-            warnings.append(f"the data do not tell an effect of {name} on any output from none")
+    first = max(params.orders) + params.longest_dead_time + 1
+    n_u, rng = len(scales[1]), np.random.default_rng(seed)
+    equations, ensembles, candidates, warnings = [], [], [], []
+    told = np.zeros(n_u, dtype=bool)
+    for i, name in enumerate(names[0]):
+        parts = [
+            Record([(piece.y[:, i] / scales[0][i], piece.u / scales[1]) for piece in pieces], first) for pieces in (training, held_out)
+        ]
+        if not all(part.pieces for part in parts):
+            raise InputError(f"no stretch of the record is longer than {2 * max(first, LONG)} samples, so no model can be identified")
+        structure, values = choose(*parts, n_u, params)
+        whole = Record([*parts[0].pieces, *parts[1].pieces], first)
+        parameters = whole.fit(structure)
+        spread = spread_of(whole, structure, parameters)
+        equations.append(Equation(structure, parameters, spread))
+        candidates.append(values)
+        told |= effects(whole, structure, parameters)
+        blocks = np.concatenate([np.arange(len(y) - whole.first) // BLOCK + 1000 * k for k, (y, _) in enumerate(whole.pieces)])
+        _, place = np.unique(blocks, return_inverse=True)
+        drawn: list[Equation] = []
+        for _ in range(4 * members):
+            weights = rng.exponential(size=place.max() + 1)[place]
+            found = Equation(structure, whole.fit(structure, parameters, weights, RESTARTS), spread)
+            if found.growth < 1 and len(drawn) < members:
+                drawn.append(found)
+        if len(drawn) < members:
+            raise InputError(f"the record does not tell whether {name} is stable, so nothing can be learned on a model of it")
+        ensembles.append(drawn)
+        if (value := whiteness(whole.errors(structure, parameters), params)) < params.white:
+            warnings.append(
+                f"the residuals of {name} are not white (p = {value:.1g}) for any model up to order {max(params.orders)}: there is a "
+                f"disturbance or a dynamic that the model does not have"
+            )
+    warnings += [f"the data do not tell an effect of {name} on any output from none" for name, seen in zip(names[1], told, strict=True) if not seen]
     return Identified(
-        model=model,
-        scales=scales,
-        lags=lags,
-        criteria={number: float(fit[0]) for number, fit in fits.items()},
-        parameters=np.hstack([a, b, c[:, None]]),
-        vector=vector,
-        errors=errors,
-        n_samples=n_samples,
-        warnings=tuple(warnings),
+        tuple(equations), assemble([equations], scales), tuple(zip(*ensembles, strict=True)), scales, tuple(candidates), tuple(warnings)
     )
 
 
-def spread_of(likelihood: VectorARX, vector: Array) -> Array:
-    """How the variance of the one-step errors grows with the deviation, (n_y, 2): a share a + b z^2 of its mean.
-
-    Least squares on the squared residuals with a, b >= 0, weighted once by what the first pass found.
-    """
-    likelihood.update(vector)
-    found = likelihood.ssm.filter()
-    variance = np.einsum("iit->ti", found.forecasts_error_cov)
-    share = (found.forecasts_error.T**2 / variance)[1:][~likelihood.last[:-1]]
-    square = (found.forecasts.T**2)[1:][~likelihood.last[:-1]]
-    rows = []
-    for values, regressor in zip(share.T, square.T, strict=True):
-        design = np.column_stack([np.ones_like(regressor), regressor])
-        fitted = np.ones_like(values)
-        for _ in range(2):
-            solution, _ = nnls(design / fitted[:, None], values / fitted)
-            fitted = np.maximum(design @ solution, 0.05 * values.mean())
-        rows.append(solution)
-    return np.array(rows)
-
-
-def _state_space(likelihood: VectorARX, vector: Array, scales: tuple[Array, Array], spread: Array) -> LinearModel:
-    """The model in deviation variables; with lags the state is (z_t, z_{t-1}, .., u_{t-1}, ..)."""
-    a, b, c, w, v = likelihood.split(vector)
-    n_y, n_u, lags = likelihood.n_y, likelihood.n_u, likelihood.lags
-    y_scale, u_scale = scales
-    a = a * y_scale[:, None] / np.tile(y_scale, lags)
-    b = b * y_scale[:, None] / np.tile(u_scale, lags)
-    n_z, n_x = n_y * lags, n_y * lags + n_u * (lags - 1)
-    state_step, input_step = np.zeros((n_x, n_x)), np.zeros((n_x, n_u))
-    state_step[:n_y] = np.hstack([a, b[:, n_u:]])
-    state_step[n_y:n_z, : n_z - n_y] = np.eye(n_z - n_y)
-    state_step[n_z + n_u :, n_z : n_x - n_u] = np.eye(max(0, n_x - n_z - n_u))
-    input_step[:n_y] = b[:, :n_u]
-    input_step[n_z : n_z + n_u] = np.eye(n_x - n_z, n_u)[:n_u]
-    pad = np.zeros(n_x - n_y)
-    fixed, gain = np.sqrt(spread).T
-    return LinearModel(
-        state_step=torch.tensor(state_step),
-        input_step=torch.tensor(input_step),
-        constant=torch.tensor(np.concatenate([c * y_scale, pad])),
-        disturbance=torch.tensor(np.concatenate([w * y_scale * fixed, pad])),
-        disturbance_gain=torch.tensor(np.concatenate([w * gain, pad])),
-        noise=torch.tensor(v * y_scale * fixed),
-        noise_gain=torch.tensor(v * gain),
-    )
+def effects(record: Record, structure: Structure, parameters: Array) -> NDArray[np.bool_]:
+    """Which inputs have an effect on the output that is no chance, (n_u,): some coefficient beyond `TOLD` standard errors."""
+    errors, slopes = record.linearised(structure, parameters)
+    deviation = np.sqrt(np.var(errors) * np.diag(np.linalg.pinv(slopes.T @ slopes)))
+    ratio = np.abs(parameters) / deviation
+    n, n_u = structure.order, len(structure.dead_times)
+    return (ratio[structure.n_own :][: n * n_u].reshape(n_u, n) > TOLD).any(1)
 
 
 @dataclass(frozen=True)
@@ -270,16 +486,14 @@ class Validation:
     """How a model does on records that it was not identified from.
 
     Attributes:
-        fit: of each output, 1 - rms(y - simulated)/std(y) over windows of one episode simulated from their inputs alone, (n_y,).
-        measured, simulated: those windows, (n windows, T, n_y), deviation variables.
-        residuals: one-step prediction errors over their predicted standard deviation, (n, n_y).
-        p_value: of the Ljung-Box test that they are white, (n_y,). warnings: in sentences.
+        fit: 1 - |y - simulated| / |y - mean| over all windows, of each output. measured, simulated: (windows, T, n_y), deviation
+            variables. residuals: one-step errors of each output, in units of their spread. p_value: of the test of Ljung and Box.
     """
 
     fit: Array
     measured: Array
     simulated: Array
-    residuals: Array
+    residuals: tuple[Array, ...]
     p_value: Array
     warnings: tuple[str, ...]
 
@@ -287,42 +501,41 @@ class Validation:
 def validate_model(
     identified: Identified, pieces: Sequence[Stretch], horizon: int, names: Sequence[str], params: PlantIdentificationParams
 ) -> Validation:
-    """Simulation fit and whiteness of the residuals on held-out stretches.
+    """Simulate windows of `horizon` samples from their inputs alone, and test the one-step residuals on held-out stretches.
 
-    A window begins in the state that the Kalman filter has found by then; after that only the inputs are used.
+    A window begins in the state that the model has found by then; after that only the inputs are used.
     """
-    likelihood = _model_of(pieces, identified.scales, identified.lags)
-    likelihood.update(identified.vector)
-    found = likelihood.ssm.filter()
-    a, b, c, _, _ = likelihood.split(identified.vector)
-    n_y, y_scale = likelihood.n_y, identified.scales[0]
-    position = np.concatenate([np.arange(len(piece)) for piece in pieces])
-    length = np.concatenate([np.full(len(piece), len(piece)) for piece in pieces])
-    warm_up = likelihood.lags + 4  # by then the filter has forgotten where it began
-    starts = np.flatnonzero(((position - warm_up) % horizon == 0) & (position >= warm_up) & (position + horizon <= length))
-    y = np.asarray(likelihood.endog)
-    if not len(starts):
-        raise InputError(f"no held-out stretch is as long as {horizon + warm_up} samples, so the model cannot be validated")
-    state = found.filtered_state[:, starts]
-    simulated = np.empty((horizon, n_y, len(starts)))
-    for t in range(horizon):
-        simulated[t] = state[:n_y]
-        state = np.vstack([a @ state + b @ likelihood.inputs[starts + t].T + c[:, None], state[: len(state) - n_y]])
-    measured = y[starts[:, None] + np.arange(horizon)]
-    simulated = simulated.transpose(2, 0, 1)
-    fit = 1 - np.sqrt(((measured - simulated) ** 2).mean((0, 1))) / measured.std((0, 1))
-    usable = position >= warm_up
-    spread = np.sqrt(np.einsum("iit->ti", found.forecasts_error_cov))
-    residuals = (found.forecasts_error.T / spread)[usable]
-    p_value = np.array([float(acorr_ljungbox(column, [params.white_lags])["lb_pvalue"].iloc[0]) for column in residuals.T])
-    warnings = [
+    model, (y_scale, u_scale) = identified.nominal, identified.scales
+    first = max(params.orders) + params.longest_dead_time + 1
+    records = [
+        Record([(piece.y[:, i] / y_scale[i], piece.u / u_scale) for piece in pieces], first) for i in range(len(y_scale))
+    ]
+    errors = [record.errors(equation.structure, equation.parameters) for record, equation in zip(records, identified.equations, strict=True)]
+    begin, warm = records[0].first, 2 * records[0].first
+    measured, states, inputs = [], [], []
+    kept = [piece for piece in pieces if len(piece) > warm]
+    for k, piece in enumerate(kept):
+        innovations = np.column_stack([errors[i][k] * y_scale[i] for i in range(len(y_scale))])
+        for start in range(warm, len(piece) - horizon + 1, horizon):
+            past = [piece.y[start - 1 - lag] for lag in range(model.lags)]
+            entered = [piece.u[start - 2 - lag] for lag in range(model.taps - 1)]
+            noise = [innovations[start - 1 - lag - begin] for lag in range(model.lags)]
+            states.append(np.concatenate([*past, *entered, *noise]))
+            inputs.append(piece.u[start - 1 : start - 1 + horizon])
+            measured.append(piece.y[start : start + horizon])
+    if not states:
+        raise InputError(f"no held-out stretch is as long as {horizon + warm} samples, so the model cannot be validated")
+    x, simulated = torch.tensor(np.array(states)), []
+    for u in torch.tensor(np.array(inputs)).unbind(1):
+        x = model.step(x, u, torch.zeros_like(x))
+        simulated.append(model.observe(x, x))
+    found, known = torch.stack(simulated, dim=1).numpy(), np.array(measured)
+    fit = 1 - np.sqrt(((known - found) ** 2).mean((0, 1))) / known.std((0, 1))
+    p_value = np.array([whiteness(error, params) for error in errors])
+    warnings = tuple(
         f"the model leaves {100 * (1 - value):.0f} % of the movement of {name} unexplained: too much to learn from"
         for name, value in zip(names, fit, strict=True)
         if value < params.least_fit
-    ]
-    warnings += [
-        f"the residuals of {name} are not white (p = {value:.1g}): there is a disturbance or a dynamic that the model does not have"
-        for name, value in zip(names, p_value, strict=True)
-        if value < params.white
-    ]
-    return Validation(fit, measured * y_scale, simulated * y_scale, residuals, p_value, tuple(warnings))
+    )
+    spread = [np.concatenate(error) for error in errors]
+    return Validation(fit, known, found, tuple(e / e.std() for e in spread), p_value, warnings)

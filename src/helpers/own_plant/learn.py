@@ -3,7 +3,6 @@
 The learning is that of the paper's plant; what differs is that a plant shows y alone, so that the features are on y.
 """
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,28 +13,32 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from helpers.learning.algorithm_1 import improve_online
 from helpers.learning.algorithm_2 import Apprenticeship, algorithm_2, initial_weights
-from helpers.learning.evaluation import scores
 from helpers.learning.features import FeatureMap, feature_names
-from helpers.learning.learner import EpochRecord, Learner
-from helpers.learning.policy import LSTMPolicy, PolicyController
+from helpers.learning.learner import Learner
+from helpers.learning.model_gradient import Descent, GradientRecord, model_gradient
+from helpers.learning.policy import LSTMPolicy
+from helpers.learning.tracking_policy import Gains, TrackingPolicy, VelocityPID
 from helpers.own_plant.description import PlantDescription, load_description
 from helpers.own_plant.episodes import Episodes, episodes, stretches
+from helpers.own_plant.gate import Verdict, judge
 from helpers.own_plant.identify import Identified, Validation, hold_out, identify, thin_out, validate_model
-from helpers.own_plant.model import LinearModel
+from helpers.own_plant.model import ArmaxModel
+from helpers.own_plant.operation import Operation, described_gains, draw_scenarios, operation, recorded_gains
 from helpers.own_plant.quality import CleanRecords, examine
 from helpers.own_plant.records import read_records
+from helpers.own_plant.rivals import PredictiveControl, tuned_pid, tuned_predictive
 from helpers.own_plant.settings import OwnPlantParams, load_own_plant
-from helpers.plant.controllers import Controller
 from helpers.plant.process import Process
-from helpers.plant.rollout import rollout, stream
-from helpers.plant.task import ControlTask, Trajectories
+from helpers.plant.rollout import stream
+from helpers.plant.task import ControlTask
+from helpers.plant.tracking import Scenarios, Tracked, Tracker, track
 from helpers.runs.progress import ProgressBar
 from helpers.settings.paper import FeatureParams, LearningParams, Params, ScaleParams, load
 
 PIECE = 5  # episodes: how long the pieces of a long record are that the model is identified from
 VARIANT = "improved"  # of Algorithms 1 and 2
+SLACK, BEYOND = 0.95, 10.0  # share of the allowed movement that is aimed at, and the price of more while the rivals are tuned
 
 
 @dataclass(frozen=True)
@@ -124,136 +127,156 @@ def open_plant(path: Path, params_root: Path, scale: str, seed: int, params: Par
 
 
 def identify_plant(plant: OwnPlant) -> tuple[Identified, Validation]:
-    """A linear model from the first part of the record, judged on its last part."""
+    """Models from the record; order and dead times, and the fit that is shown, are judged on its last part.
+
+    Raises:
+        InputError: if no stable model describes the record.
+    """
     description, params = plant.description, plant.params.identification
-    pieces = stretches(plant.clean, description, max(params.lags) + 1)
-    first, last = hold_out(pieces, params.held_out)
+    first, last = hold_out(stretches(plant.clean, description, 2), params.held_out)
     scales = (
         np.array([abs(variable.scale) for variable in description.controlled]),
         np.array([(variable.high - variable.low) / 2 for variable in description.manipulated]),
     )
-    training = thin_out(first, params.longest, PIECE * description.horizon)
+    training, held_out = (thin_out(part, params.longest, PIECE * description.horizon) for part in (first, last))
     names = (plant.controlled, plant.manipulated)
-    identified = identify(training, scales, names, params, plant.epochs(params.iterations))
-    held_out = thin_out(last, params.longest, PIECE * description.horizon)
+    identified = identify(training, held_out, scales, names, params, max(4, plant.epochs(params.members)), plant.seed)
     return identified, validate_model(identified, held_out, description.horizon, plant.controlled, params)
 
 
-def task_on(plant: OwnPlant, model: LinearModel) -> ControlTask:
+def task_on(plant: OwnPlant, model: ArmaxModel) -> ControlTask:
     """The task on an identified model: its first state is where the demonstrations began, at rest."""
     y, before = plant.demonstrations.trajectories.y[0].double(), plant.demonstrations.before.double()
-    std = (y.var(0) - model.noise.double() ** 2).clamp(min=0).sqrt()
-    lags = -(-(model.n_states - model.n_outputs) // (model.n_outputs + model.n_inputs))
-    means = [y.mean(0)] * (lags + 1) + [before.mean(0)] * lags
-    stds = [std] * (lags + 1) + [before.std(0)] * lags
+    spread = model.spread[0, :, 0].double()
+    std = (y.var(0) - spread**2).clamp(min=0).sqrt()
+    zero = torch.zeros_like(std).repeat(model.lags)
+    means = [y.mean(0).repeat(model.lags), before.mean(0).repeat(model.taps - 1), zero]
+    stds = [std.repeat(model.lags), before.std(0).repeat(model.taps - 1), zero]
     return plant.task(torch.cat(means), torch.cat(stds))
 
 
-def task_at_rest(plant: OwnPlant, process: Process) -> ControlTask:
-    """The task on a process whose states are its outputs, begun where the demonstrations began."""
-    y = plant.demonstrations.trajectories.y[0]
-    if process.n_states == process.n_outputs:
-        return plant.task(y.mean(0), y.std(0))
-    return plant.task(torch.zeros(process.n_states), torch.zeros(process.n_states))  # of other states nothing is known but u* = 0
-
-
-def learn_offline(
-    plant: OwnPlant, process: Process, task: ControlTask, start: tuple[LSTMPolicy, Tensor] | None = None
-) -> Apprenticeship:
-    """Algorithm 2 on whatever stands for the plant; from the policy and the weights of another task, if given."""
-    variant, learning, scale = plant.learning.variants[VARIANT], plant.params.learning, plant.scale
-    n_epochs = plant.epochs(learning.offline_epochs if start is None else learning.transfer_epochs)
-    policy = plant.fresh_policy(task) if start is None else start[0]
-    weights = initial_weights(variant.weights, len(plant.controlled), plant.dtype) if start is None else start[1]
+def learn_offline(plant: OwnPlant, process: Process, task: ControlTask) -> Apprenticeship:
+    """Algorithm 2 on whatever stands for the plant: what the record's controller was after, as weights, and a policy like it."""
+    variant, scale = plant.learning.variants[VARIANT], plant.scale
+    n_epochs = plant.epochs(plant.params.learning.offline_epochs)
+    weights = initial_weights(variant.weights, len(plant.controlled), plant.dtype)
+    policy, features = plant.fresh_policy(task), plant.features(task)
     policy.reset_exploration(variant.exploration)
-    features = plant.features(task)
-    generator = plant.stream("offline" if start is None else "transfer")
-    learner = Learner(policy, process, features, variant.learner, scale.episodes, n_epochs, generator)
+    learner = Learner(policy, process, features, variant.learner, scale.episodes, n_epochs, plant.stream("offline"))
     expert = features.trajectory(plant.demonstrations.trajectories).mean(0)
-    progress = ProgressBar(n_epochs, "offline")
-    return algorithm_2(learner, expert, weights, variant.weights, n_epochs, scale.measured, progress)
-
-
-def improve_on(plant: OwnPlant, policy: LSTMPolicy, process: Process, task: ControlTask) -> tuple[LSTMPolicy, list[EpochRecord]]:
-    """Online learning under the tracking objective on whatever stands for the plant, read from y."""
-    online, learning = plant.learning.online, plant.params.learning
-    n_epochs = [plant.epochs(number) for number in learning.online_epochs]
-    policy.reset_exploration(online.exploration)
-    n_episodes = min(online.episodes, plant.scale.episodes + plant.scale.measured)
-    learner = Learner(policy, process, plant.features(task), online.learner, n_episodes, sum(n_epochs), plant.stream("online"))
-    records = improve_online(learner, n_epochs, learning.online_beta, ProgressBar(sum(n_epochs), "online"))
-    return learner.average, records
-
-
-def compare(
-    plant: OwnPlant, process: Process, task: ControlTask, controllers: Mapping[str, Controller | LSTMPolicy]
-) -> dict[str, Trajectories]:
-    """Fresh trajectories of each controller on the same disturbances; a policy is deployed with its mode."""
-    return {
-        name: rollout(
-            process,
-            PolicyController(controller, task, exploring=False) if isinstance(controller, LSTMPolicy) else controller,
-            task,
-            plant.scale.evaluation,
-            plant.stream("evaluation"),
-        )
-        for name, controller in controllers.items()
-    }
-
-
-def as_measured(trajectories: Trajectories) -> Trajectories:
-    """The same with the observations in the place of the states, which a plant does not show."""
-    return replace(trajectories, x=trajectories.y)
-
-
-def judge(plant: OwnPlant, task: ControlTask, batches: Mapping[str, Trajectories]) -> pd.DataFrame:
-    """Figures of merit of each batch on the observations, a column each; `gap` is the feature gap to the demonstrations."""
-    features, beta = plant.features(task), plant.params.learning.online_beta[-1]
-    expert = features.trajectory(plant.demonstrations.trajectories).mean(0)
-    columns: dict[str, dict[str, Any]] = {}
-    for name, batch in batches.items():
-        rows = scores(as_measured(batch), features, beta, plant.controlled, plant.manipulated)
-        mean = features.trajectory(batch).mean(0)
-        gap = ((expert - mean) / expert.abs()).abs().mean().item()
-        kept = {key: value for key, value in rows.items() if not key.endswith(":std") and key not in ("objective_x", "objective_y")}
-        columns[name] = kept | {"feature gap": gap}
-    return pd.DataFrame(columns)
+    return algorithm_2(learner, expert, weights, variant.weights, n_epochs, scale.measured, ProgressBar(n_epochs, "offline"))
 
 
 @dataclass(frozen=True)
-class Transfer:
-    """Policy and weights carried to other set points: the plant with that task, the policy after each step, and the task."""
+class Workshop:
+    """Everything that controllers are tuned, trained and judged on; float32, as they run.
+
+    Attributes:
+        operation: the range of set points, the loops and the bounds. record: the PID of the record, and `explained` of its moves.
+        nominal: the most likely model. training, held_out: models drawn for learning and for the gate, from different members.
+    """
 
     plant: OwnPlant
-    offline: Apprenticeship
-    online: LSTMPolicy
-    task: ControlTask
+    operation: Operation
+    record: Gains
+    explained: float
+    nominal: ArmaxModel
+    training: ArmaxModel
+    held_out: ArmaxModel
+
+    @property
+    def n_steps(self) -> int:
+        """Samples of an episode: long enough for two set point steps."""
+        return min(2 * self.plant.description.horizon, self.plant.params.operation.longest)
+
+    def draw(self, models: ArmaxModel, n_episodes: int, generator: torch.Generator, longer: int = 1, quiet: bool = False) -> Scenarios:
+        """Episodes of models drawn from these; `longer` than those of training by this factor."""
+        drawn = models.members(torch.randint(len(models), (n_episodes,), generator=generator))
+        return draw_scenarios(drawn, self.operation, self.plant.params.operation, longer * self.n_steps, generator, quiet)
+
+    def reference(self, scenarios: Scenarios) -> tuple[Tensor, Tensor]:
+        """Mean |e| and movement of the record's PID in each episode, (K,) each."""
+        with torch.no_grad():
+            run = track(VelocityPID(self.record), scenarios, self.operation.bounds)
+        return self.operation.error(run), self.operation.movement(run)
 
 
-def transfer(
-    plant: OwnPlant, learned: Apprenticeship, model: LinearModel, process: Process, set_points: Mapping[str, float]
-) -> Transfer:
-    """Section 5.3 on records: offline on the demonstrations of other set points, online on what stands for the plant.
+def open_workshop(plant: OwnPlant, identified: Identified) -> Workshop:
+    """Draw the models, find the record's PID and the range of operation.
 
-    Args:
-        set_points: in engineering units, by name of the controlled variable.
+    Raises:
+        InputError: if the record's controller is no PID and the description names none.
     """
-    other = plant.with_set_points(set_points)
-    start = copy.deepcopy(learned.policy), learned.weights
-    offline = learn_offline(other, model, task_on(other, model), start)
-    task = task_at_rest(other, process)
-    online, _ = improve_on(other, copy.deepcopy(offline.policy), process, task)
-    return Transfer(other, offline, online, task)
+    dtype, params, clean, description = torch.float32, plant.params, plant.clean, plant.description
+    found, explained = recorded_gains(clean, description, dtype)
+    record = described_gains(description, dtype) or found
+    loops = tuple(torch.nonzero(record.integral.abs().sum(0) > 0).flatten().tolist())
+    if not loops:
+        raise InputError(f"{description.title}: no loop with integral action is found in the record: describe its controller under 'pid'")
+    half = max(1, len(identified.members) * 3 // 4)
+    parts = replace(identified, members=identified.members[:half]), replace(identified, members=identified.members[half:] or identified.members)
+    n_models = max(16, plant.epochs(params.policy.models))
+    training, held_out = (part.ensemble(params.margins, n_models, plant.seed + k).to(dtype) for k, part in enumerate(parts))
+    return Workshop(
+        plant, operation(clean, description, loops, dtype), record, explained, identified.nominal.to(dtype), training, held_out
+    )  # fmt: skip
+
+
+def tune(workshop: Workshop) -> tuple[Gains, PredictiveControl]:
+    """The rivals: the record's PID re-tuned, and predictive control, each at its best on the models of training."""
+    plant, params = workshop.plant, workshop.plant.params.rivals
+    scenarios = workshop.draw(workshop.training, params.episodes, plant.stream("rivals"))
+    reference = workshop.reference(scenarios)
+
+    def price(error: Tensor, movement: Tensor) -> Tensor:
+        beyond = (movement.mean(-1) / reference[1].mean() / plant.params.policy.movement - SLACK).clamp(min=0)
+        return (error / reference[0]).mean(-1) + BEYOND * beyond
+
+    generations = params.model_copy(update={"generations": plant.epochs(params.generations)})
+    gains = tuned_pid(workshop.nominal, scenarios, workshop.record, workshop.operation, price, generations, plant.seed)
+    return gains, tuned_predictive(workshop.nominal, scenarios, workshop.operation, price, params)
+
+
+def learn_policy(workshop: Workshop, start: Gains, purpose: str = "policy") -> tuple[TrackingPolicy, list[GradientRecord]]:
+    """One policy for the whole range, by the gradient through the models; it begins as the PID `start`."""
+    plant, operation = workshop.plant, workshop.operation
+    params, generator = plant.params.policy, plant.stream(purpose)
+    torch.manual_seed(int(torch.randint(2**31, (1,), generator=generator)))  # torch.nn draws the first weights from the global stream
+    policy = TrackingPolicy(plant.learning.policy, start, operation.unit, operation.centre, operation.unit, operation.bounds)
+
+    def measure(scenarios: Scenarios, run: Tracked) -> tuple[Tensor, Tensor]:
+        error, movement = workshop.reference(scenarios)
+        return operation.error(run) / error, operation.movement(run) / movement / params.movement
+
+    descent = Descent(plant.epochs(params.steps))
+    records = model_gradient(
+        policy, lambda: workshop.draw(workshop.training, params.episodes, generator), measure, operation.bounds, descent,
+        ProgressBar(descent.steps, purpose),
+    )  # fmt: skip
+    return policy, records
+
+
+def pass_gate(workshop: Workshop, candidates: Mapping[str, Tracker]) -> Verdict:
+    """All candidates on models held out, in episodes twice as long as those of training."""
+    params, generator = workshop.plant.params, workshop.plant.stream("gate")
+    noisy, quiet = (
+        workshop.draw(workshop.held_out, params.gate.episodes, generator, longer=2, quiet=still) for still in (False, True)
+    )
+    return judge(candidates, noisy, quiet, workshop.operation, params.policy.movement, params.gate)
 
 
 def parameter_table(plant: OwnPlant, identified: Identified) -> pd.DataFrame:
-    """A, B and c of the identified model with their standard errors, scaled; a row for each output."""
-    before = [*(f"A {name}" for name in plant.controlled), *(f"B {name}" for name in plant.manipulated)]
-    lagged = [f"{name} at lag {lag}" for kind in "AB" for lag in range(identified.lags) for name in before if name.startswith(kind)]
-    columns = [*(before if identified.lags == 1 else lagged), "c"]
-    values = pd.DataFrame(identified.parameters, index=plant.controlled, columns=columns)
-    errors = pd.DataFrame(identified.errors, index=plant.controlled, columns=columns)
-    return pd.concat({"value": values.T, "standard error": errors.T}, axis=1)
+    """What was identified, a row an output: order, dead times, gains or rates, and the spread of the innovations; scaled."""
+    rows = {}
+    for name, equation in zip(plant.controlled, identified.equations, strict=True):
+        structure = equation.structure
+        kind = "rate" if structure.integrating else "gain"
+        free = 1 - equation.parameters[: structure.n_own].sum()
+        row: dict[str, Any] = {"order": structure.order, "integrating": structure.integrating}
+        for j, entry in enumerate(plant.manipulated):
+            row |= {f"dead time of {entry}": structure.dead_times[j], f"{kind} of {entry}": equation.inputs[j].sum() / free}
+        rows[name] = row | {"noise": equation.spread[0], "noise, share of y": equation.spread[1]}
+    return pd.DataFrame(rows).T
 
 
 def history(records: Sequence[Any], names: Sequence[str]) -> pd.DataFrame:

@@ -4,7 +4,8 @@ Each is a `process.Process` in deviation variables.
 """
 
 import importlib
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -18,47 +19,86 @@ from helpers.settings.leaf import InputError
 GYMNASIUM = "gymnasium:"
 
 
-@dataclass
-class LinearModel:
-    """A discrete-time linear state-space model with its disturbance and its measurement noise.
+@dataclass(frozen=True)
+class ArmaxModel:
+    """Models of a plant side by side, deviation variables; one step is one sample.
 
-    x_{t+1} = A x_t + B u_t + c + s_w(x_t) w_t, y_t = C x_t + s_v(x_t) v_t with w, v ~ N(0, I); one step is one sample.
-    Both standard deviations have a fixed part and one that grows with the deviation as in Eq. 4.1.3c and 4.1.4b:
-    s(x)^2 = fixed^2 + (gain x)^2.
-
-    The first n_y states are the outputs without noise, so C is (I, 0); with more than one lag the states also hold
-    earlier outputs and inputs.
+    y_{t+1} = W x_t + V u_t + c + e_{t+1} with x_t = (y_t, y_{t-1}, .., u_{t-1}, .., e_t, e_{t-1}, ..): what is measured is a state, and
+    the innovations e carry disturbance and noise of the sensor at once. Their standard deviation has a fixed part and one that
+    grows with the deviation, as in Eq. 4.1.3c and 4.1.4b: s(y)^2 = fixed^2 + (gain y)^2.
 
     Attributes:
-        state_step: A (n_x, n_x). input_step: B (n_x, n_u). constant: c (n_x,).
-        disturbance, disturbance_gain: of s_w, (n_x,). noise, noise_gain: of s_v, (n_y,).
+        window: W (M, n_y, n_x). entry: V (M, n_y, n_u). constant: c (M, n_y). spread: fixed part and gain of s, (M, n_y, 2).
+        lags: of y and of e that x holds. taps: of u, the present one included.
     """
 
-    state_step: Tensor
-    input_step: Tensor
+    window: Tensor
+    entry: Tensor
     constant: Tensor
-    disturbance: Tensor
-    disturbance_gain: Tensor
-    noise: Tensor
-    noise_gain: Tensor
+    spread: Tensor
+    lags: int
+    taps: int
 
-    def __post_init__(self) -> None:
-        self.n_states, self.n_inputs = self.input_step.shape
-        self.n_outputs = len(self.noise)
+    @property
+    def n_outputs(self) -> int:
+        """n_y."""
+        return self.entry.shape[1]
+
+    @property
+    def n_inputs(self) -> int:
+        """n_u."""
+        return self.entry.shape[2]
+
+    @property
+    def n_states(self) -> int:
+        """n_x."""
+        return self.window.shape[2]
+
+    def __len__(self) -> int:
+        return len(self.window)
+
+    def members(self, index: Tensor | slice) -> "ArmaxModel":
+        """Some of the models, a model an entry of the index."""
+        return replace(self, **{name: getattr(self, name)[index] for name in ("window", "entry", "constant", "spread")})
+
+    def to(self, dtype: torch.dtype) -> "ArmaxModel":
+        """The same in another number type."""
+        return replace(self, **{name: getattr(self, name).to(dtype) for name in ("window", "entry", "constant", "spread")})
 
     def step(self, x: Tensor, u: Tensor, noise: Tensor) -> Tensor:
-        """The next state, shape (K, n_x)."""
-        kick = (self.disturbance**2 + (self.disturbance_gain * x) ** 2).sqrt() * noise
-        return torch.addmm(self.constant + kick, x, self.state_step.T).addmm_(u, self.input_step.T)
+        """The next state, shape (K, n_x), of one model or of one an episode; of the noise (K, n_x) the first n_y columns are used."""
+        n_y, n_u = self.n_outputs, self.n_inputs
+        y = self.constant + (self.window @ x[..., None] + self.entry @ u[..., None])[..., 0]
+        e = (self.spread[..., 0] ** 2 + (self.spread[..., 1] * y) ** 2).sqrt() * noise[:, :n_y]
+        widths = [n_y * self.lags, n_u * (self.taps - 1), n_y * self.lags]
+        outputs, inputs, innovations = x.split(widths, dim=-1)
+        moved = torch.cat([u, inputs], dim=-1)[:, : widths[1]]
+        return torch.cat([y + e, outputs[:, :-n_y], moved, e, innovations[:, :-n_y]], dim=-1)
 
     def observe(self, x: Tensor, noise: Tensor) -> Tensor:
-        """The outputs, shape (K, n_y)."""
-        outputs = x[:, : self.n_outputs]
-        return outputs + (self.noise**2 + (self.noise_gain * outputs) ** 2).sqrt() * noise
+        """The outputs, shape (K, n_y), which hold their noise already."""
+        return x[:, : self.n_outputs]
 
-    def to(self, dtype: torch.dtype) -> "LinearModel":
-        """The same in another number type."""
-        return LinearModel(*(getattr(self, entry.name).to(dtype) for entry in fields(self)))
+    def at_rest(self, y: Tensor, held: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+        """The state (K, n_x), the outputs and the input (K, n_u) at which the undisturbed models rest with some outputs at y.
+
+        Args:
+            y: (K, n_y), of which only the outputs in `held` count.
+        """
+        n_y, n_u = self.n_outputs, self.n_inputs
+        own = self.window[..., : n_y * self.lags].unflatten(-1, (self.lags, n_y)).sum(-2)  # sum of the A_i, (M, n_y, n_y)
+        gain = self.entry + self.window[..., n_y * self.lags : -n_y * self.lags].unflatten(-1, (-1, n_u)).sum(-2)
+        kept = torch.eye(n_y, dtype=own.dtype) - own
+        rows = list(held)
+        need = (kept[:, rows][..., rows] @ y[:, rows, None])[..., 0] - self.constant[:, rows]
+        u = (torch.linalg.pinv(gain[:, rows]) @ need[..., None])[..., 0]
+        free = [index for index in range(n_y) if index not in rows]
+        rest = y.clone()
+        for index in free:
+            drive = (gain[:, index] * u).sum(-1) + self.constant[:, index]
+            rest[:, index] = drive / kept[:, index, index]
+        x = torch.cat([rest.repeat(1, self.lags), u.repeat(1, self.taps - 1), torch.zeros_like(rest).repeat(1, self.lags)], dim=-1)
+        return x, rest, u
 
 
 class GymnasiumPlant:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, Strict
 
 from helpers.settings.leaf import Count, Leaf, Positive, Record, Share, read_yaml, validate
 
@@ -26,22 +26,68 @@ class PlantIdentificationParams(Record):
     """How a model is identified and judged."""
 
     held_out: Annotated[Positive, Field(lt=1), Leaf("share")]
-    lags: Annotated[tuple[Count, ...], Field(min_length=1), Leaf("samples")]
+    orders: Annotated[tuple[Count, ...], Field(min_length=1), Leaf("-")]
+    longest_dead_time: Annotated[Count, Leaf("samples")]
     longest: Annotated[Count, Leaf("samples")]
-    iterations: Annotated[Count, Leaf("iterations")]
+    members: Annotated[Count, Leaf("models")]
     white: Annotated[Share, Leaf("-")]
     white_lags: Annotated[Count, Leaf("samples")]
     least_fit: Annotated[Share, Leaf("share")]
 
 
+class MarginParams(Record):
+    """How far the plant may be from its model beyond what its record leaves open."""
+
+    gain: Annotated[Share, Leaf("share")]
+    time: Annotated[Share, Leaf("share")]
+    dead_time: Annotated[int, Strict(), Field(ge=0), Leaf("samples")]
+
+
+class OperationParams(Record):
+    """What the episodes are like that controllers are trained and judged on."""
+
+    still: Annotated[Share, Leaf("share")]
+    reserve: Annotated[Share, Leaf("input range")]
+    load: Annotated[Share, Leaf("input range")]
+    longest: Annotated[Count, Leaf("samples")]
+
+
+class RivalParams(Record):
+    """How the rivals are tuned."""
+
+    episodes: Annotated[Count, Leaf("episodes")]
+    generations: Annotated[Count, Leaf("generations")]
+    population: Annotated[Count, Leaf("candidates")]
+    response: Annotated[Count, Leaf("samples")]
+    horizon: Annotated[Count, Leaf("samples")]
+    penalties: Annotated[tuple[Positive, ...], Field(min_length=1), Leaf("-")]
+    observer: Annotated[tuple[Share, ...], Field(min_length=1), Leaf("-")]
+
+
+class PlantPolicyParams(Record):
+    """How the policy for a whole range learns through the model."""
+
+    models: Annotated[Count, Leaf("models")]
+    episodes: Annotated[Count, Leaf("episodes")]
+    steps: Annotated[Count, Leaf("gradient steps")]
+    movement: Annotated[Positive, Leaf("movement of the record's controller")]
+
+
+class GateParams(Record):
+    """What a controller must show on models held out before it is released."""
+
+    episodes: Annotated[Count, Leaf("episodes")]
+    better: Annotated[Share, Leaf("share")]
+    offset: Annotated[Share, Leaf("range of the set points")]
+    close: Annotated[Share, Leaf("share")]
+
+
 class PlantLearningParams(Record):
-    """How long a policy learns."""
+    """How long the paper's offline learning lasts."""
 
     offline_epochs: Annotated[Count, Leaf("epochs")]
-    transfer_epochs: Annotated[Count, Leaf("epochs")]
-    online_epochs: Annotated[tuple[Count, ...], Field(min_length=1), Leaf("epochs")]
-    online_beta: Annotated[tuple[Positive, ...], Field(min_length=1), Leaf("-")]
     error_unit: Annotated[Positive, Leaf("error scale")]
+    beta: Annotated[Positive, Leaf("-")]
 
 
 class OwnPlantParams(Record):
@@ -49,6 +95,11 @@ class OwnPlantParams(Record):
 
     quality: QualityParams
     identification: PlantIdentificationParams
+    margins: MarginParams
+    operation: OperationParams
+    rivals: RivalParams
+    policy: PlantPolicyParams
+    gate: GateParams
     learning: PlantLearningParams
 
 

@@ -6,6 +6,7 @@ from tqdm.auto import tqdm
 
 from helpers.learning.algorithm_2 import IterationRecord
 from helpers.learning.learner import EpochRecord
+from helpers.learning.model_gradient import GradientRecord
 
 
 class ProgressBar:
@@ -17,9 +18,12 @@ class ProgressBar:
     def __init__(self, n_epochs: int, description: str) -> None:
         self.bar = tqdm(total=n_epochs, desc=description, unit="epoch", leave=False, disable=bool(os.environ.get("TQDM_DISABLE")))
 
-    def __call__(self, record: EpochRecord | IterationRecord) -> None:
+    def __call__(self, record: EpochRecord | IterationRecord | GradientRecord) -> None:
         """Move to the record's epoch."""
-        shown = {"return": f"{record.mean_return:.2f}"}
+        if isinstance(record, GradientRecord):
+            shown = {"cost": f"{record.cost:.3f}", "movement": f"{record.movement:.2f}"}
+        else:
+            shown = {"return": f"{record.mean_return:.2f}"}
         if isinstance(record, IterationRecord):
             shown["feature gap"] = f"{100 * record.feature_gap:.1f} %"
         self.bar.set_postfix(shown, refresh=False)

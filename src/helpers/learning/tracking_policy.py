@@ -1,0 +1,107 @@
+"""One policy for a range of set points: a PID in velocity form plus what a recurrent network adds to it.
+
+u_t = u_{t-1} + P (e_t - e_{t-1}) + I e_t + D (e_t - 2 e_{t-1} + e_{t-2}) + c_t - c_{t-1}, with e = y_sp - y and c_t the network's
+correction. At rest c does not change, so that I e = 0: no offset stays, whatever the network has learned. The input before is
+the one that was applied, so that nothing winds up at a bound. Where the network's output layer is zero the policy is the PID.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from helpers.plant.tracking import Bounds
+from helpers.settings.paper import PolicyParams
+
+SHARPNESS = 10.0  # asinh(10 e) tells small errors apart and does not run away for large ones
+
+
+@dataclass(frozen=True)
+class Gains:
+    """A linear law on the errors, each (n_u, n_y) or one an episode, per sample: P, I and D."""
+
+    proportional: Tensor
+    integral: Tensor
+    derivative: Tensor
+
+    def command(self, error: Tensor, memory: tuple[Tensor, Tensor], u_previous: Tensor) -> Tensor:
+        """The PID in velocity form; `memory` holds the errors one and two samples before, each (..., n_y)."""
+        once, twice = memory
+        parts = zip((self.proportional, self.integral, self.derivative), (error - once, error, error - 2 * once + twice), strict=True)
+        return u_previous + sum((gain @ signal[..., None])[..., 0] for gain, signal in parts)
+
+
+class VelocityPID:
+    """A PID in velocity form for many set points; before the first sample the error is zero."""
+
+    def __init__(self, gains: Gains) -> None:
+        self.gains = gains
+
+    def start(self, n_trajectories: int) -> tuple[Tensor, Tensor]:
+        """No error before."""
+        zero = self.gains.integral.new_zeros(n_trajectories, self.gains.integral.shape[-1])
+        return zero, zero
+
+    def act(
+        self, y: Tensor, set_point: Tensor, u_previous: Tensor, memory: tuple[Tensor, Tensor]
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """The law at one sample."""
+        error = set_point - y
+        return self.gains.command(error, memory, u_previous), (error, memory[0])
+
+
+class TrackingPolicy(nn.Module):
+    """The policy of this module; deviation variables.
+
+    The network sees each error in units of its scale, the set point and the input applied last within their ranges. Its layers are
+    those of Section 3.2.
+
+    Args:
+        gains: of the PID that it starts from. unit: scale of each error (n_y,).
+        centre, reach: middle and half width of the range of set points, (n_y,).
+    """
+
+    def __init__(self, params: PolicyParams, gains: Gains, unit: Tensor, centre: Tensor, reach: Tensor, bounds: Bounds) -> None:
+        super().__init__()
+        self.params = params
+        n_u, n_y = gains.integral.shape
+        widths = [2 * n_y + n_u, *params.hidden_cells]
+        self.layers = nn.ModuleList(nn.LSTM(below, width) for below, width in zip(widths, params.hidden_cells, strict=False))
+        self.output = nn.Linear(widths[-1], n_u)
+        self.to(unit.dtype)
+        nn.init.zeros_(self.output.weight)
+        nn.init.zeros_(self.output.bias)
+        for name, value in (("proportional", gains.proportional), ("derivative", gains.derivative)):
+            self.register_parameter(name, nn.Parameter(value.clone()))
+        self.integral_log = nn.Parameter(torch.zeros_like(gains.integral))  # the integral action keeps its sign and never vanishes
+        for name, value in (
+            ("integral_start", gains.integral), ("unit", unit), ("centre", centre), ("reach", reach), ("low", bounds.low), ("high", bounds.high)
+        ):  # fmt: skip
+            self.register_buffer(name, value.clone())
+
+    @property
+    def gains(self) -> Gains:
+        """The PID inside."""
+        return Gains(self.proportional, self.integral_start * self.integral_log.exp(), self.derivative)
+
+    def start(self, n_trajectories: int) -> tuple[Tensor, ...]:
+        """Zero: errors one and two samples before, the correction before, and h and c of each layer."""
+        n_u, n_y = self.integral_start.shape
+        widths = [n_y, n_y, n_u, *(width for width in self.params.hidden_cells for _ in "hc")]
+        return tuple(self.unit.new_zeros(n_trajectories, width) for width in widths)
+
+    def act(self, y: Tensor, set_point: Tensor, u_previous: Tensor, memory: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """The command and the memory for the next sample."""
+        error = set_point - y
+        once, twice, before, *states = memory
+        middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
+        seen = [torch.asinh(SHARPNESS * error / self.unit), (set_point - self.centre) / self.reach, (u_previous - middle) / half]
+        signal = torch.cat(seen, dim=-1)
+        after: list[Tensor] = []
+        for index, layer in enumerate(self.layers):
+            after += torch.lstm_cell(signal, states[2 * index : 2 * index + 2], *layer.all_weights[0])
+            signal = functional.leaky_relu(after[-2], self.params.leaky_slope)
+        correction = self.output(signal) * half
+        command = self.gains.command(error, (once, twice), u_previous) + correction - before
+        return command, (error, once, correction, *after)

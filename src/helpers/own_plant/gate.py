@@ -1,0 +1,95 @@
+"""The gate: no controller is released before it has shown on models held out that it is better than the one of the record."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import pandas as pd
+import torch
+
+from helpers.own_plant.operation import Operation
+from helpers.own_plant.settings import GateParams
+from helpers.plant.tracking import Scenarios, Tracked, Tracker, track
+
+RECORD, TUNED, PREDICTIVE, POLICY = "PID of the record", "re-tuned PID", "predictive control", "policy"
+SIMPLEST = (RECORD, TUNED, PREDICTIVE, POLICY)  # of two controllers that do as well, the one to keep
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the gate found.
+
+    Attributes:
+        table: a row a controller: mean |e| and movement as shares of those of the record's PID, share of the episodes in which it
+            is better, greatest offset as a share of the range, whether it passes.
+        released: whether the policy passes. keep: the controller to keep. words: the sentence that says so.
+    """
+
+    table: pd.DataFrame
+    released: bool
+    keep: str
+    words: str
+
+
+def offsets(run: Tracked, operation: Operation) -> torch.Tensor:
+    """The greatest |e| of each undisturbed episode just before a set point moves and at its end, in ranges of the set points, (K,)."""
+    reach = torch.where(operation.high > operation.low, operation.high - operation.low, operation.unit)
+    error = (run.error.abs() / reach)[..., list(operation.loops)].amax(-1)
+    return error[-1]
+
+
+def judge(
+    candidates: Mapping[str, Tracker], noisy: Scenarios, quiet: Scenarios, operation: Operation, allowed: float, params: GateParams
+) -> Verdict:
+    """Every candidate on the same episodes of models held out; `quiet` ones tell the offset.
+
+    Args:
+        candidates: by name, the record's PID among them. allowed: movement, as a multiple of that of the record's PID.
+    """
+    rows, errors = {}, {}
+    with torch.no_grad():
+        for name, tracker in candidates.items():
+            run = track(tracker, noisy, operation.bounds)
+            errors[name], movement = operation.error(run).double(), operation.movement(run).double()
+            if name == RECORD:
+                moved = movement
+            rest = offsets(track(tracker, quiet, operation.bounds), operation)
+            rows[name] = {
+                "mean |e|": (errors[name] / errors[RECORD]).mean().item(),
+                "movement": (movement.mean() / moved.mean()).item(),
+                "better": (errors[name] < errors[RECORD]).double().mean().item(),
+                "offset": rest.nan_to_num(torch.inf).quantile(params.better).item(),
+            }
+    table = pd.DataFrame(rows).T
+    fine = (table["better"] >= params.better) & (table["movement"] <= allowed) & (table["offset"] <= params.offset)
+    table["passes"] = fine
+    released = bool(fine.get(POLICY, False))
+    passing = [name for name in SIMPLEST if name in rows and (name == RECORD or fine[name])]
+    best = min(table.loc[name, "mean |e|"] for name in passing)
+    keep = next(name for name in passing if table.loc[name, "mean |e|"] <= best * (1 + params.close))
+    return Verdict(table, released, keep, _words(table, released, keep, allowed, params))
+
+
+def _words(table: pd.DataFrame, released: bool, keep: str, allowed: float, params: GateParams) -> str:
+    """The first line of the report."""
+
+    def share(name: str) -> str:
+        return f"its mean |e| is {100 * table.loc[name, 'mean |e|']:.0f} % of that of the record's PID at {100 * table.loc[name, 'movement']:.0f} % of its movement"
+
+    if keep == POLICY:
+        return f"verdict: release the policy: on models held out {share(POLICY)}, and it is better in {100 * table.loc[POLICY, 'better']:.0f} % of the episodes"
+    policy = table.loc[POLICY]
+    faults = [
+        words
+        for bad, words in (
+            (policy["better"] < params.better, f"is better in only {100 * policy['better']:.0f} % of the episodes"),
+            (policy["movement"] > allowed, f"moves the inputs {policy['movement']:.2f} times as much"),
+            (policy["offset"] > params.offset, f"leaves an offset of up to {100 * policy['offset']:.1f} % of the range"),
+        )
+        if bad
+    ]
+    if released:
+        return f"verdict: take the {keep}: {share(keep)}; the policy passes the gate too, with {100 * policy['mean |e|']:.0f} %, but is less simple"
+    why = f"the policy is not released: against the record's PID it {', '.join(faults)}"
+    if keep == RECORD:
+        return f"verdict: keep the PID: {why}"
+    return f"verdict: keep the PID, re-tuned: {share(keep)}; {why}" if keep == TUNED else f"verdict: take {keep}: {share(keep)}; {why}"

@@ -1,0 +1,198 @@
+"""What a practitioner would take: the PID of the record, the same re-tuned on all models, and offset-free predictive control."""
+
+from collections.abc import Callable
+
+import cma
+import numpy as np
+import torch
+from torch import Tensor
+
+from helpers.learning.tracking_policy import Gains, VelocityPID
+from helpers.own_plant.model import ArmaxModel
+from helpers.own_plant.operation import Operation
+from helpers.own_plant.settings import RivalParams
+from helpers.plant.tracking import Scenarios, track
+
+Price = Callable[[Tensor, Tensor], Tensor]  # of each episode's mean |e| and movement, (..., K) each
+
+
+def side_by_side(scenarios: Scenarios, n_copies: int) -> Scenarios:
+    """The same episodes several times over, for several controllers at once."""
+    model = scenarios.process
+    assert isinstance(model, ArmaxModel)
+    index = torch.arange(len(model)).repeat(n_copies)
+    return Scenarios(
+        model.members(index), scenarios.set_point[:, index], scenarios.load[:, index], scenarios.start[index], scenarios.before[index],
+        scenarios.disturbance[:, index], scenarios.noise[:, index],
+    )  # fmt: skip
+
+
+def step_response(model: ArmaxModel, n_steps: int) -> np.ndarray:
+    """The undisturbed outputs after a unit step of each input, from rest at zero, (n_u, n_steps + 1, n_y)."""
+    still = ArmaxModel(model.window, model.entry, torch.zeros_like(model.constant), model.spread * 0, model.lags, model.taps)
+    still = still.members(torch.zeros(model.n_inputs, dtype=torch.long))
+    x, u = model.window.new_zeros(model.n_inputs, model.n_states), torch.eye(model.n_inputs, dtype=model.window.dtype)
+    outputs = [still.observe(x, x)]
+    for _ in range(n_steps):
+        x = still.step(x, u, torch.zeros_like(x))
+        outputs.append(still.observe(x, x))
+    return torch.stack(outputs, dim=1).numpy()
+
+
+def simc(response: np.ndarray) -> tuple[float, float]:
+    """P and I per sample of a PI by the SIMC rule (Skogestad 2003, Section 4) with a closed-loop time constant of the dead time.
+
+    The first-order model is read off a step response, (n,): gain, and the times at which 28 and 63 % of it are reached. A response
+    that still goes up at its end is that of an integrator.
+    """
+    end, slope = response[-1], response[-1] - response[-2]
+    if abs(slope) * len(response) > 0.5 * abs(end):
+        rate = slope
+        dead = max(1.0, len(response) - 1 - end / slope)
+        return 1 / (rate * 2 * dead), 1 / (rate * 2 * dead) / (8 * dead)
+    share = response / end
+    early, late = (float(np.argmax(share >= level)) for level in (0.283, 0.632))
+    time = max(1.0, 1.5 * (late - early))
+    dead = max(1.0, late - time)
+    gain = time / (end * 2 * dead)
+    return gain, gain / min(time, 8 * dead)
+
+
+def tuned_pid(
+    nominal: ArmaxModel, scenarios: Scenarios, record: Gains, operation: Operation, price: Price, params: RivalParams, seed: int
+) -> Gains:
+    """The PID of the record with its gains re-tuned on all models at once, from several starts, by CMA-ES (Hansen 2016).
+
+    The starts are the record's gains, those with a third of the integral action, and those of the SIMC rule for each loop.
+    """
+    places = torch.nonzero(record.integral.abs() + record.proportional.abs() > 0).tolist()
+    kinds = [kind for kind in ("proportional", "integral", "derivative") if getattr(record, kind).abs().sum() > 0]
+    response = step_response(nominal.to(torch.float64), params.response)
+
+    def base(rule: str) -> dict[str, Tensor]:
+        found = {kind: getattr(record, kind).clone() for kind in ("proportional", "integral", "derivative")}
+        for j, i in places:
+            gain, integral = simc(response[j, :, i]) if rule == "simc" else (found["proportional"][j, i], found["integral"][j, i])
+            if np.isfinite(float(gain)) and float(gain) * float(found["integral"][j, i]) >= 0:
+                found["proportional"][j, i], found["integral"][j, i] = gain, integral * (1 / 3 if rule == "slow" else 1)
+        return found
+
+    def gains(start: dict[str, Tensor], logs: Tensor) -> Gains:
+        """Gains of many candidates, each (n, n_u, n_y), from the logarithms of their factors (n, kinds x places)."""
+        factors = logs.exp().reshape(len(logs), len(kinds), len(places))
+        found = {kind: value.expand(len(logs), -1, -1).clone() for kind, value in start.items()}
+        for row, kind in enumerate(kinds):
+            for column, (j, i) in enumerate(places):
+                found[kind][:, j, i] *= factors[:, row, column]
+        return Gains(**found)
+
+    def costs(start: dict[str, Tensor], logs: Tensor) -> list[float]:
+        n_episodes = scenarios.start.shape[0]
+        many = gains(start, logs)
+        spread = Gains(*(getattr(many, kind).repeat_interleave(n_episodes, dim=0) for kind in ("proportional", "integral", "derivative")))
+        with torch.no_grad():
+            run = track(VelocityPID(spread), side_by_side(scenarios, len(logs)), operation.bounds)
+        shape = (len(logs), n_episodes)
+        value = price(operation.error(run).reshape(shape), operation.movement(run).reshape(shape))
+        return [float(v) if np.isfinite(float(v)) else 1e9 for v in value]
+
+    best: tuple[float, Gains] | None = None
+    dtype = record.integral.dtype
+    for number, rule in enumerate(("record", "slow", "simc")):
+        start = base(rule)
+        options = {"seed": seed + number + 1, "verbose": -9, "maxiter": params.generations, "popsize": params.population}
+        search = cma.CMAEvolutionStrategy([0.0] * (len(kinds) * len(places)), 0.4, options)
+        while not search.stop():
+            asked = search.ask()
+            search.tell(asked, costs(start, torch.tensor(np.array(asked), dtype=dtype)))
+        found = torch.tensor(search.result.xbest, dtype=dtype)[None]
+        for logs in (found, torch.zeros_like(found)):
+            value = costs(start, logs)[0]
+            if best is None or value < best[0]:
+                chosen = gains(start, logs)
+                best = (value, Gains(chosen.proportional[0], chosen.integral[0], chosen.derivative[0]))
+    assert best is not None
+    return best[1]
+
+
+class PredictiveControl:
+    """Offset-free predictive control in increments (generalised predictive control, Clarke et al. 1987), its first move clipped.
+
+    It minimises sum_{i=1..N} |(y_sp - y_{t+i}) / unit|^2 + penalty sum_{i=0..N-1} |Delta u_{t+i} / span|^2 along the identified model written in
+    increments, A(q) Delta y = B(q) Delta u + C(q) (1 - kappa q^-1) e: the observer's zero kappa lets the disturbance drift, so that no
+    offset stays. Without bounds the plan is a linear law; a constrained one differs from its clipped form only while an input sits
+    at a bound.
+
+    Args:
+        model: one member. horizon: N, samples.
+    """
+
+    def __init__(self, model: ArmaxModel, operation: Operation, horizon: int, penalty: float, kappa: float) -> None:
+        n_y, n_u, lags, taps = model.n_outputs, model.n_inputs, model.lags, model.taps
+        dtype = model.window.dtype
+        own, inputs, zeros = model.window[0].double().split([n_y * lags, n_u * (taps - 1), n_y * lags], dim=-1)
+        one = torch.cat([torch.eye(n_y, dtype=own.dtype), zeros], dim=-1).unflatten(-1, (-1, n_y))
+        drifting = torch.cat([one, torch.zeros(n_y, 1, n_y, dtype=own.dtype)], 1)
+        drifting[:, 1:] -= kappa * one
+        padded = torch.cat([own, torch.zeros(n_y, n_y, dtype=own.dtype)], dim=-1)
+        window = torch.cat([padded, inputs, drifting[:, 1:].flatten(1)], dim=-1)
+        self.model = ArmaxModel(window[None], model.entry.double()[:1], torch.zeros(1, n_y).double(), torch.zeros(1, n_y, 2).double(), lags + 1, taps)
+        self.operation, loops = operation, list(operation.loops)
+        n_x = self.model.n_states
+        x, still = torch.eye(n_x, dtype=own.dtype), torch.zeros(n_x, n_u, dtype=own.dtype)
+        first = self.model.step(torch.zeros(n_u, n_x).double(), torch.eye(n_u).double(), torch.zeros(n_u, n_x).double())
+        free, forced = [], [self.model.observe(first, first)]
+        for _ in range(horizon):
+            x = self.model.step(x, still, torch.zeros_like(x))
+            first = self.model.step(first, still[:n_u], torch.zeros_like(first))
+            free.append(self.model.observe(x, x))
+            forced.append(self.model.observe(first, first))
+        ahead = torch.stack(free).cumsum(0)[..., loops]  # (N, n_x, loops): what is to come without a further move
+        step = torch.stack(forced[:-1]).cumsum(0)[..., loops]  # (N, n_u, loops): after a unit move
+        effect = torch.zeros(horizon, len(loops), horizon, n_u, dtype=own.dtype)
+        for i in range(horizon):
+            effect[i:, :, i] = step[: horizon - i].mT
+        scale = operation.unit[loops].double()
+        weighted = (effect / scale[:, None, None]).reshape(horizon * len(loops), -1)
+        moves = penalty * operation.bounds.span.double().repeat(horizon) ** -2
+        law = torch.linalg.solve(weighted.T @ weighted + moves.diag(), weighted.T)[:n_u].reshape(n_u, horizon, len(loops)) / scale
+        self.on_error = torch.zeros(n_u, n_y, dtype=own.dtype)
+        self.on_error[:, loops] = law.sum(1)
+        self.on_state = torch.einsum("uil,ixl->ux", law, ahead).to(dtype)
+        self.on_error = self.on_error.to(dtype)
+        self.model = self.model.to(dtype)
+
+    def start(self, n_trajectories: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """At rest: the window of increments, the output and the input before (nan: none yet), and the move before."""
+        n_y, n_u = self.model.n_outputs, self.model.n_inputs
+        zero = self.on_state.new_zeros
+        return zero(n_trajectories, self.model.n_states), zero(n_trajectories, n_y) * torch.nan, zero(n_trajectories, n_u) * torch.nan, zero(0)
+
+    def act(self, y: Tensor, set_point: Tensor, u_previous: Tensor, memory: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """The first move of the plan made at this sample."""
+        x, y_before, u_before, _ = memory
+        n_y, lags = self.model.n_outputs, self.model.lags
+        change, move = torch.nan_to_num(y - y_before), torch.nan_to_num(u_previous - u_before)
+        x = self.model.step(x, move, torch.zeros_like(x))
+        x = x.clone()
+        x[:, -n_y * lags :][:, :n_y] = change - x[:, :n_y]  # the innovation
+        x[:, :n_y] = change
+        command = u_previous + (set_point - y) @ self.on_error.T - x @ self.on_state.T
+        return command, (x, y, u_previous, x)
+
+
+def tuned_predictive(
+    nominal: ArmaxModel, scenarios: Scenarios, operation: Operation, price: Price, params: RivalParams
+) -> PredictiveControl:
+    """Predictive control whose penalty on moves and observer do best on all models."""
+    best: tuple[float, PredictiveControl] | None = None
+    for kappa in params.observer:
+        for penalty in params.penalties:
+            control = PredictiveControl(nominal.to(operation.unit.dtype), operation, params.horizon, penalty, kappa)
+            with torch.no_grad():
+                run = track(control, scenarios, operation.bounds)
+            value = float(price(operation.error(run)[None], operation.movement(run)[None])[0])
+            if best is None or value < best[0]:
+                best = (value, control)
+    assert best is not None
+    return best[1]

@@ -7,24 +7,25 @@ same gradient from returns alone: it needs no model, but explores, and its varia
 process whose `step` torch can differentiate, draws no input at random, and costs no episode of the plant.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from helpers.learning.learner import TrainingError, annealed
+from helpers.learning.tracking_policy import TrackingPolicy
 from helpers.plant.process import Process
 from helpers.plant.tracking import Bounds, Scenarios, Tracked, track
 
 Draw = Callable[[], Scenarios]
+Watch = Callable[["GradientRecord"], object]  # called with the record of each step
 Measure = Callable[[Scenarios, Tracked], tuple[Tensor, Tensor]]  # of each episode: cost, and movement as a share of what is allowed
 
 
 @dataclass(frozen=True)
 class GradientRecord:
-    """One epoch, which is one gradient step: mean cost, mean movement as a share of what is allowed, the price on it, and the length of the gradient."""
+    """One gradient step: mean cost, movement as a share of what is allowed, the price on it, and the length of the gradient."""
 
     epochs: int
     cost: float
@@ -60,7 +61,7 @@ def differentiable(process: Process) -> bool:
 
 
 def model_gradient(
-    policy: Any, draw: Draw, measure: Measure, bounds: Bounds, descent: Descent, watch: Callable[[GradientRecord], object] = lambda _: None
+    policy: TrackingPolicy, draw: Draw, measure: Measure, bounds: Bounds, descent: Descent, watch: Watch = lambda record: None
 ) -> list[GradientRecord]:
     """Improve a policy in place: lower the mean cost, with no more movement than allowed.
 
@@ -68,12 +69,11 @@ def model_gradient(
     cost + price (movement - slack). The price is a Lagrange multiplier: it rises while the movement exceeds its limit.
 
     Args:
-        policy: a module that is a `Tracker`.
+        draw: gives the episodes of a step. measure: what they cost.
 
     Raises:
         TrainingError: if cost or gradient are not finite.
     """
-    assert isinstance(policy, nn.Module)
     optimiser = torch.optim.Adam(policy.parameters(), lr=descent.rate_start)
     price, records = descent.price, []
     for step in range(descent.steps):

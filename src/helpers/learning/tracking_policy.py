@@ -28,7 +28,9 @@ class Gains:
     def command(self, error: Tensor, memory: tuple[Tensor, Tensor], u_previous: Tensor) -> Tensor:
         """The PID in velocity form; `memory` holds the errors one and two samples before, each (..., n_y)."""
         once, twice = memory
-        parts = zip((self.proportional, self.integral, self.derivative), (error - once, error, error - 2 * once + twice), strict=True)
+        parts = zip(
+            (self.proportional, self.integral, self.derivative), (error - once, error, error - 2 * once + twice), strict=True
+        )
         return u_previous + sum((gain @ signal[..., None])[..., 0] for gain, signal in parts)
 
 
@@ -62,6 +64,13 @@ class TrackingPolicy(nn.Module):
         centre, reach: middle and half width of the range of set points, (n_y,).
     """
 
+    unit: Tensor
+    centre: Tensor
+    reach: Tensor
+    low: Tensor
+    high: Tensor
+    integral: Tensor
+
     def __init__(self, params: PolicyParams, gains: Gains, unit: Tensor, centre: Tensor, reach: Tensor, bounds: Bounds) -> None:
         super().__init__()
         self.params = params
@@ -72,26 +81,45 @@ class TrackingPolicy(nn.Module):
         self.to(unit.dtype)
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
-        for name, value in (("proportional", gains.proportional), ("derivative", gains.derivative)):
-            self.register_parameter(name, nn.Parameter(value.clone()))
-        self.integral_log = nn.Parameter(torch.zeros_like(gains.integral))  # the integral action keeps its sign and never vanishes
-        for name, value in (
-            ("integral_start", gains.integral), ("unit", unit), ("centre", centre), ("reach", reach), ("low", bounds.low), ("high", bounds.high)
-        ):  # fmt: skip
+        buffers = {
+            "unit": unit,
+            "centre": centre,
+            "reach": reach,
+            "low": bounds.low,
+            "high": bounds.high,
+            "integral": gains.integral,
+        }
+        for name, value in buffers.items():
             self.register_buffer(name, value.clone())
+        # In half ranges of the input over units of the error, so that a step of the optimiser means as much in every loop.
+        self.proportional = nn.Parameter(gains.proportional / self._scale)
+        self.derivative = nn.Parameter(gains.derivative / self._scale)
+        self.integral_log = nn.Parameter(torch.zeros_like(gains.integral))  # the integral action keeps its sign and never vanishes
+
+    @property
+    def lstms(self) -> list[nn.LSTM]:
+        """The hidden layers, from the input upwards."""
+        return [layer for layer in self.layers if isinstance(layer, nn.LSTM)]
+
+    @property
+    def _scale(self) -> Tensor:
+        return (self.high - self.low)[:, None] / 2 / self.unit
 
     @property
     def gains(self) -> Gains:
         """The PID inside."""
-        return Gains(self.proportional, self.integral_start * self.integral_log.exp(), self.derivative)
+        scale = self._scale
+        return Gains(self.proportional * scale, self.integral * self.integral_log.exp(), self.derivative * scale)
 
     def start(self, n_trajectories: int) -> tuple[Tensor, ...]:
         """Zero: errors one and two samples before, the correction before, and h and c of each layer."""
-        n_u, n_y = self.integral_start.shape
+        n_u, n_y = self.integral.shape
         widths = [n_y, n_y, n_u, *(width for width in self.params.hidden_cells for _ in "hc")]
         return tuple(self.unit.new_zeros(n_trajectories, width) for width in widths)
 
-    def act(self, y: Tensor, set_point: Tensor, u_previous: Tensor, memory: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, ...]]:
+    def act(
+        self, y: Tensor, set_point: Tensor, u_previous: Tensor, memory: tuple[Tensor, ...]
+    ) -> tuple[Tensor, tuple[Tensor, ...]]:
         """The command and the memory for the next sample."""
         error = set_point - y
         once, twice, before, *states = memory
@@ -99,7 +127,7 @@ class TrackingPolicy(nn.Module):
         seen = [torch.asinh(SHARPNESS * error / self.unit), (set_point - self.centre) / self.reach, (u_previous - middle) / half]
         signal = torch.cat(seen, dim=-1)
         after: list[Tensor] = []
-        for index, layer in enumerate(self.layers):
+        for index, layer in enumerate(self.lstms):
             after += torch.lstm_cell(signal, states[2 * index : 2 * index + 2], *layer.all_weights[0])
             signal = functional.leaky_relu(after[-2], self.params.leaky_slope)
         correction = self.output(signal) * half

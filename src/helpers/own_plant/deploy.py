@@ -1,9 +1,8 @@
-"""A policy as a file that a plant can run: ONNX, one sample a call, engineering units in and out.
+"""A policy as a file that a plant can run: ONNX, one sample a call, engineering units in and out; and the same as C source.
 
-The hidden states of the network are inputs and outputs of the file, so that it keeps no memory; scaling and bounds are inside.
+The memory of the policy is inputs and outputs of the file, so that it keeps none itself; scaling and bounds are inside.
 """
 
-import copy
 import json
 import warnings
 from dataclasses import dataclass
@@ -14,63 +13,102 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
+from emx_onnx_cgen.compiler import Compiler, CompilerOptions
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from helpers.learning.policy import LSTMPolicy
-from helpers.plant.task import ControlTask
+from helpers.learning.tracking_policy import SHARPNESS, TrackingPolicy
 from helpers.settings.leaf import InputError
 
 Array = NDArray[np.float64]
 OPSET = 17
+STATIC = "_static"  # ends the name of the file with batch 1 and fixed shapes
 
 
 class PolicyStep(nn.Module):
-    """One sample of a policy's mode: (y, y_sp, u_previous, h, c of each layer) to (u, h, c), rows are trajectories.
+    """One sample of a `TrackingPolicy` in operations that every runtime has: (y, y_sp, u_previous, memory) to (u, memory).
 
-    y, y_sp and u are in engineering units and in double precision: a deviation is taken before anything is rounded.
+    Engineering units, double precision, rows are trajectories. The network runs in single precision, as it was trained; a
+    deviation is taken before anything is rounded.
     """
 
-    def __init__(self, policy: LSTMPolicy, task: ControlTask, steady_y: Tensor, steady_u: Tensor) -> None:
+    proportional: Tensor
+    integral: Tensor
+    derivative: Tensor
+    unit: Tensor
+    centre: Tensor
+    reach: Tensor
+    low: Tensor
+    high: Tensor
+    steady_y: Tensor
+    steady_u: Tensor
+    output_weight: Tensor
+    output_bias: Tensor
+
+    def __init__(self, policy: TrackingPolicy, steady_y: Tensor, steady_u: Tensor) -> None:
         super().__init__()
-        single = copy.deepcopy(policy).float()  # onnxruntime has no LSTM in double precision
-        self.layers, self.output, self.slope = single.layers, single.output, policy.params.leaky_slope
-        self.n_inputs = policy.n_manipulated
-        self.error_unit = nn.Buffer(policy.error_unit.double())
-        self.low = nn.Buffer(task.input_low.double() + steady_u)
-        self.high = nn.Buffer(task.input_high.double() + steady_u)
+        self.cells = list(policy.params.hidden_cells)
+        self.slope = policy.params.leaky_slope
+        doubles = vars(policy.gains) | {"steady_y": steady_y, "steady_u": steady_u}
+        doubles |= {name: getattr(policy, name) for name in ("unit", "centre", "reach", "low", "high")}
+        for name, value in doubles.items():
+            self.register_buffer(name, value.detach().double())
+        singles = {"output_weight": policy.output.weight, "output_bias": policy.output.bias}
+        for index, layer in enumerate(policy.lstms):
+            below, before, bias_below, bias_before = layer.all_weights[0]
+            singles |= {f"weight_{index}": torch.cat([below, before], dim=1), f"bias_{index}": bias_below + bias_before}
+        for name, value in singles.items():
+            self.register_buffer(name, value.detach().float())
 
-    def forward(self, y: Tensor, set_point: Tensor, u_previous: Tensor, *states: Tensor) -> tuple[Tensor, ...]:
-        """The input to apply, (K, n_u), and the states for the next sample, h and c of each layer, (1, K, cells)."""
+    def forward(self, y: Tensor, set_point: Tensor, u_previous: Tensor, *memory: Tensor) -> tuple[Tensor, ...]:
+        """The input to apply, (K, n_u), and the memory for the next sample: two errors, the correction, h and c of each layer."""
+        once, twice, before, *states = memory
+        error = set_point - y
         middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
-        signal = torch.cat([(set_point - y) / self.error_unit, (u_previous - middle) / half], dim=-1).float()[None]
+        scaled = SHARPNESS * error / self.unit
+        sharp = torch.sign(scaled) * torch.log(scaled.abs() + torch.sqrt(scaled**2 + 1))  # asinh, which not every runtime has
+        last = u_previous - self.steady_u
+        seen = [sharp, (set_point - self.steady_y - self.centre) / self.reach, (last - middle) / half]
+        signal = torch.cat(seen, dim=-1).float()
         after: list[Tensor] = []
-        for index, layer in enumerate(self.layers):
-            hidden, state = layer(signal, (states[2 * index], states[2 * index + 1]))
-            after += state
+        for index, width in enumerate(self.cells):
+            hidden, cell = states[2 * index], states[2 * index + 1]
+            weight, bias = getattr(self, f"weight_{index}"), getattr(self, f"bias_{index}")
+            gates = functional.linear(torch.cat([signal, hidden], dim=-1), weight, bias)
+            entry, forget, candidate, exit_ = gates.split(width, dim=-1)
+            cell = torch.sigmoid(forget) * cell + torch.sigmoid(entry) * torch.tanh(candidate)
+            hidden = torch.sigmoid(exit_) * torch.tanh(cell)
+            after += [hidden, cell]
             signal = functional.leaky_relu(hidden, self.slope)
-        share = functional.hardtanh(self.output(signal[0])[:, : self.n_inputs], 0.0, 6.0).double() / 6.0  # ReLU6, Eq. 3.2.5
-        return (self.low + (self.high - self.low) * share, *after)
+        correction = functional.linear(signal, self.output_weight, self.output_bias).double() * half
+        law = (error - once) @ self.proportional.T + error @ self.integral.T + (error - 2 * once + twice) @ self.derivative.T
+        command = last + law + correction - before
+        u = torch.minimum(torch.maximum(command, self.low), self.high) + self.steady_u
+        return (u, error, once, correction, *after)
 
 
-def state_names(policy: LSTMPolicy) -> list[str]:
-    """h and c of each layer, as the file calls them."""
-    return [f"{kind}_{index}" for index in range(len(policy.lstms)) for kind in ("h", "c")]
+def memory_names(policy: TrackingPolicy) -> list[str]:
+    """The errors one and two samples before, the correction before, and h and c of each layer, as the file calls them."""
+    states = [f"{kind}_{index}" for index in range(len(policy.lstms)) for kind in "hc"]
+    return ["error_1", "error_2", "correction", *states]
 
 
-def export(policy: LSTMPolicy, task: ControlTask, steady_y: Tensor, steady_u: Tensor, path: Path, notes: dict[str, Any]) -> Path:
-    """Write a policy as ONNX; `notes` go into the file, and with them a name and a unit for every variable.
+def export(
+    policy: TrackingPolicy, steady_y: Tensor, steady_u: Tensor, path: Path, notes: dict[str, Any], static: bool = False
+) -> Path:
+    """Write a policy as ONNX; `notes` go into the file.
 
     Args:
         steady_y, steady_u: the steady state in engineering units, (n_y,) and (n_u,).
+        static: for one trajectory with fixed shapes, which controllers without dynamic shapes need; otherwise for any number.
     """
-    module = PolicyStep(policy, task, steady_y, steady_u).train(False)
-    names = state_names(policy)
-    states = [torch.zeros(1, 1, layer.hidden_size) for layer in policy.lstms for _ in ("h", "c")]
-    example = (steady_y.double()[None], steady_y.double()[None], steady_u.double()[None], *states)
-    axes = {name: {0: "K"} for name in ("y", "set_point", "u_previous", "u")}
-    axes |= {f"{name}{suffix}": {1: "K"} for name in names for suffix in ("", "_next")}
+    module = PolicyStep(policy, steady_y, steady_u).train(False)
+    names = memory_names(policy)
+    memory = [entry.double() if place < 3 else entry.float() for place, entry in enumerate(policy.start(1))]
+    example = (steady_y.double()[None], steady_y.double()[None], steady_u.double()[None], *memory)
+    outputs = ["u", *(f"{name}_next" for name in names)]
+    axes = {name: {0: "K"} for name in ("y", "set_point", "u_previous", *names, *outputs)}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter warns that its successor needs two more packages
         torch.onnx.export(
@@ -78,8 +116,8 @@ def export(policy: LSTMPolicy, task: ControlTask, steady_y: Tensor, steady_u: Te
             example,
             path,
             input_names=["y", "set_point", "u_previous", *names],
-            output_names=["u", *(f"{name}_next" for name in names)],
-            dynamic_axes=axes,
+            output_names=outputs,
+            dynamic_axes=None if static else axes,
             opset_version=OPSET,
             dynamo=False,
         )
@@ -90,9 +128,19 @@ def export(policy: LSTMPolicy, task: ControlTask, steady_y: Tensor, steady_u: Te
     return path
 
 
+def export_c(static: Path, path: Path) -> Path:
+    """The static file as one C source without dependencies: `policy(y, set_point, u_previous, memory.., u, memory_next..)`."""
+    path.write_text(Compiler(CompilerOptions(model_name="policy")).compile(onnx.load(static)), encoding="utf-8")
+    return path
+
+
 @dataclass
 class DeployedPolicy:
-    """A policy file in onnxruntime, one thread: call it once a sample."""
+    """A policy file in onnxruntime, one thread: call it once a sample.
+
+    Raises:
+        InputError: if the file is no policy, or its notes cannot be read.
+    """
 
     path: Path
 
@@ -103,41 +151,49 @@ class DeployedPolicy:
             self.session = onnxruntime.InferenceSession(str(self.path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's own errors have no common kind
             raise InputError(f"{self.path}: not a policy that can be run: {' '.join(str(error).split())[:200]}") from error
-        self.names = [entry.name for entry in self.session.get_inputs()][3:]
-        self.shapes = [entry.shape for entry in self.session.get_inputs()][3:]
-        self.notes = {key: json.loads(value) for key, value in self.session.get_modelmeta().custom_metadata_map.items()}
+        inputs = self.session.get_inputs()[3:]
+        self.names = [entry.name for entry in inputs]
+        self.shapes = [entry.shape for entry in inputs]
+        self.types = [np.float64 if "double" in entry.type else np.float32 for entry in inputs]
+        self.notes: dict[str, Any] = {}
+        for key, value in self.session.get_modelmeta().custom_metadata_map.items():
+            try:
+                self.notes[key] = json.loads(value)
+            except ValueError as error:
+                raise InputError(f"{self.path}: the note '{key}' of the policy cannot be read: {error}") from error
         self.reset()
 
     def reset(self, n_trajectories: int = 1) -> None:
-        """Zero hidden states, as before the first sample of an episode."""
-        self.states = [np.zeros((shape[0], n_trajectories, shape[2]), dtype=np.float32) for shape in self.shapes]
+        """Nothing remembered, as before the first sample of an episode."""
+        sizes = zip(self.shapes, self.types, strict=True)
+        self.memory = [np.zeros((n_trajectories, *shape[1:]), dtype=kind) for shape, kind in sizes]
 
     def step(self, y: Array, set_point: Array, u_previous: Array) -> Array:
         """The input for this sample, (K, n_u), from measurement, set point and the input applied last; engineering units."""
-        feed = dict(zip(self.names, self.states, strict=True))
-        u, *self.states = self.session.run(None, {"y": y, "set_point": set_point, "u_previous": u_previous, **feed})
+        feed = dict(zip(self.names, self.memory, strict=True))
+        u, *self.memory = self.session.run(None, {"y": y, "set_point": set_point, "u_previous": u_previous, **feed})
         return np.asarray(u)
 
 
 def disagreement(
-    policy: LSTMPolicy, deployed: DeployedPolicy, task: ControlTask, y: Tensor, u: Tensor, steady_y: Tensor, steady_u: Tensor
+    policy: TrackingPolicy, deployed: DeployedPolicy, y: Tensor, set_point: Tensor, steady_y: Tensor, steady_u: Tensor
 ) -> float:
     """The greatest difference between file and torch along episodes, as a share of the input range.
 
     Args:
-        y, u: recorded episodes in deviation variables, (T or T + 1, K, n_y) and (T, K, n_u).
+        y, set_point: in deviation variables, (T, K, n_y).
     """
-    with torch.no_grad():
-        mean, _ = policy(y, u, task)
-    expected = (mean.double() + steady_u).numpy()
-    measured, inputs = (y.double() + steady_y).numpy(), (u.double() + steady_u).numpy()
-    set_point = np.broadcast_to((task.set_point.double() + steady_y).numpy(), measured[0].shape).copy()
-    span = (task.input_high - task.input_low).double().numpy()
-    deployed.reset(y.shape[1])
-    u_previous = np.broadcast_to(steady_u.double().numpy(), inputs[0].shape).copy()
+    n_trajectories, dtype = y.shape[1], policy.unit.dtype
+    memory, u = policy.start(n_trajectories), torch.zeros(n_trajectories, len(steady_u), dtype=dtype)
+    span = (policy.high - policy.low).double().numpy()
+    deployed.reset(n_trajectories)
     worst = 0.0
-    for t in range(len(u)):
-        found = deployed.step(measured[t], set_point, u_previous)
-        worst = float(np.maximum(worst, np.abs((found - expected[t]) / span).max()))  # nan stays, which max() would drop
-        u_previous = inputs[t]
+    with torch.no_grad():
+        for measured, aim in zip(y.to(dtype), set_point.to(dtype), strict=True):
+            command, memory = policy.act(measured, aim, u, memory)
+            applied = (u.double() + steady_u).numpy()
+            u = torch.clamp(command, policy.low, policy.high)
+            found = deployed.step((measured.double() + steady_y).numpy(), (aim.double() + steady_y).numpy(), applied)
+            expected = (u.double() + steady_u).numpy()
+            worst = float(np.maximum(worst, np.abs((found - expected) / span).max()))  # nan stays, which max() would drop
     return worst

@@ -20,18 +20,19 @@ class Verdict:
 
     Attributes:
         table: a row a controller: mean |e| and movement as shares of those of the record's PID, share of the episodes in which it
-            is better, greatest offset as a share of the range, whether it passes.
+            is better, offset as a share of the range, whether it passes. episodes: the first two of each episode; a row each.
         released: whether the policy passes. keep: the controller to keep. words: the sentence that says so.
     """
 
     table: pd.DataFrame
+    episodes: pd.DataFrame
     released: bool
     keep: str
     words: str
 
 
 def offsets(run: Tracked, operation: Operation) -> torch.Tensor:
-    """The greatest |e| of each undisturbed episode just before a set point moves and at its end, in ranges of the set points, (K,)."""
+    """|e| at the end of each undisturbed episode, of the worst loop, in ranges of the set points, (K,)."""
     reach = torch.where(operation.high > operation.low, operation.high - operation.low, operation.unit)
     error = (run.error.abs() / reach)[..., list(operation.loops)].amax(-1)
     return error[-1]
@@ -45,13 +46,15 @@ def judge(
     Args:
         candidates: by name, the record's PID among them. allowed: movement, as a multiple of that of the record's PID.
     """
-    rows, errors = {}, {}
+    rows, errors, episodes = {}, {}, []
     with torch.no_grad():
         for name, tracker in candidates.items():
             run = track(tracker, noisy, operation.bounds)
             errors[name], movement = operation.error(run).double(), operation.movement(run).double()
             if name == RECORD:
                 moved = movement
+            parts = {"mean |e|": errors[name] / errors[RECORD], "movement": movement / moved}
+            episodes.append(pd.DataFrame(parts).assign(controller=name))
             rest = offsets(track(tracker, quiet, operation.bounds), operation)
             rows[name] = {
                 "mean |e|": (errors[name] / errors[RECORD]).mean().item(),
@@ -66,30 +69,30 @@ def judge(
     passing = [name for name in SIMPLEST if name in rows and (name == RECORD or fine[name])]
     best = min(table.loc[name, "mean |e|"] for name in passing)
     keep = next(name for name in passing if table.loc[name, "mean |e|"] <= best * (1 + params.close))
-    return Verdict(table, released, keep, _words(table, released, keep, allowed, params))
+    return Verdict(table, pd.concat(episodes, ignore_index=True), released, keep, _words(table, released, keep, allowed, params))
 
 
 def _words(table: pd.DataFrame, released: bool, keep: str, allowed: float, params: GateParams) -> str:
     """The first line of the report."""
 
     def share(name: str) -> str:
-        return f"its mean |e| is {100 * table.loc[name, 'mean |e|']:.0f} % of that of the record's PID at {100 * table.loc[name, 'movement']:.0f} % of its movement"
+        error, movement = table.loc[name, "mean |e|"], table.loc[name, "movement"]
+        return f"its mean |e| is {100 * error:.0f} % of that of the record's PID at {100 * movement:.0f} % of its movement"
 
     if keep == POLICY:
-        return f"verdict: release the policy: on models held out {share(POLICY)}, and it is better in {100 * table.loc[POLICY, 'better']:.0f} % of the episodes"
+        better = f"it is better in {100 * table.loc[POLICY, 'better']:.0f} % of the episodes"
+        return f"verdict: release the policy: on models held out {share(POLICY)}, and {better}"
     policy = table.loc[POLICY]
+    rival = "" if keep == RECORD else f"; {keep} would do: {share(keep)}"
+    if released:
+        return f"verdict: the policy may be released ({share(POLICY)}), but {keep} is as good and simpler: {share(keep)}"
     faults = [
         words
         for bad, words in (
-            (policy["better"] < params.better, f"is better in only {100 * policy['better']:.0f} % of the episodes"),
-            (policy["movement"] > allowed, f"moves the inputs {policy['movement']:.2f} times as much"),
-            (policy["offset"] > params.offset, f"leaves an offset of up to {100 * policy['offset']:.1f} % of the range"),
+            (policy["better"] < params.better, f"it is better in only {100 * policy['better']:.0f} % of the episodes"),
+            (policy["movement"] > allowed, f"it moves the inputs {policy['movement']:.2f} times as much"),
+            (policy["offset"] > params.offset, f"it leaves an offset of {100 * policy['offset']:.1f} % of the range"),
         )
         if bad
     ]
-    if released:
-        return f"verdict: take the {keep}: {share(keep)}; the policy passes the gate too, with {100 * policy['mean |e|']:.0f} %, but is less simple"
-    why = f"the policy is not released: against the record's PID it {', '.join(faults)}"
-    if keep == RECORD:
-        return f"verdict: keep the PID: {why}"
-    return f"verdict: keep the PID, re-tuned: {share(keep)}; {why}" if keep == TUNED else f"verdict: take {keep}: {share(keep)}; {why}"
+    return f"verdict: keep the PID: the policy is not released: {' and '.join(faults)}{rival}"

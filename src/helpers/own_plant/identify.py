@@ -141,6 +141,12 @@ class Record:
         self.pieces = [piece for piece in pieces if len(piece[0]) > 2 * self.first]
         self.length = sum(len(piece[0]) - self.first for piece in self.pieces)
 
+    @classmethod
+    def of(cls, pieces: Sequence[Stretch], output: int, scales: tuple[Array, Array], params: PlantIdentificationParams) -> "Record":
+        """The record of one output, scaled, for every structure that the settings allow."""
+        first = max(params.orders) + params.longest_dead_time + 1
+        return cls([(piece.y[:, output] / scales[0][output], piece.u / scales[1]) for piece in pieces], first)
+
     def regression(self, structure: Structure) -> list[tuple[Array, Array]]:
         """Target (n,) and regressors (n, p) of each stretch: own past, inputs, and one."""
         found, first = [], self.first
@@ -231,7 +237,7 @@ def _least_squares(rows: Sequence[tuple[Array, Array]]) -> Array:
 
 
 def _solve(past: Array, target: Array) -> Array:
-    """Least squares by the normal equations of scaled columns: many rows and few columns, ten times as fast as by an orthogonal basis."""
+    """Least squares by the normal equations of scaled columns: for many rows and few columns ten times as fast as numpy's."""
     size = np.sqrt((past**2).sum(0)) + 1e-12
     scaled = past / size
     return np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(len(size)), scaled.T @ target) / size
@@ -262,7 +268,9 @@ def dead_times(record: Record, order: int, integrating: bool, start: tuple[int, 
             return found
 
 
-def choose(training: Record, held_out: Record, n_inputs: int, params: PlantIdentificationParams) -> tuple[Structure, dict[Structure, float]]:
+def choose(
+    training: Record, held_out: Record, n_inputs: int, params: PlantIdentificationParams
+) -> tuple[Structure, dict[Structure, float]]:
     """The simplest structure whose likelihood on held-out records is within one standard error of the greatest.
 
     Of those the simplest with white residuals, if there is one.
@@ -384,7 +392,7 @@ class Identified:
     """A model and how it came about.
 
     Attributes:
-        equations: the fitted equation of each output. nominal: the model of them. members: the equations of each member of the ensemble.
+        equations: the fitted equation of each output. nominal: the model of them. members: those of each member of the ensemble.
         scales: of outputs and inputs, in whose units the equations stand.
         candidates: of each output, the mean log likelihood per held-out sample by structure.
         warnings: what the data cannot carry, in sentences.
@@ -421,30 +429,27 @@ def spread_of(record: Record, structure: Structure, parameters: Array) -> Array:
 
 
 def identify(
-    training: Sequence[Stretch], held_out: Sequence[Stretch], scales: tuple[Array, Array], names: tuple[Sequence[str], Sequence[str]],
+    parts: tuple[Sequence[Stretch], Sequence[Stretch]], scales: tuple[Array, Array], names: tuple[Sequence[str], Sequence[str]],
     params: PlantIdentificationParams, members: int, seed: int,
 ) -> Identified:  # fmt: skip
     """Structure by records held out, then parameters and ensemble from all of them.
 
     Args:
-        training, held_out: deviation variables. scales: what counts as much in outputs (n_y,) and inputs (n_u,).
+        parts: stretches to fit and stretches held out, deviation variables. scales: of outputs (n_y,) and inputs (n_u,).
         names: of outputs and inputs, for the warnings. members: of the ensemble.
 
     Raises:
         InputError: if no stretch is long enough, or no stable model describes the record.
     """
-    first = max(params.orders) + params.longest_dead_time + 1
     n_u, rng = len(scales[1]), np.random.default_rng(seed)
     equations, ensembles, candidates, warnings = [], [], [], []
     told = np.zeros(n_u, dtype=bool)
     for i, name in enumerate(names[0]):
-        parts = [
-            Record([(piece.y[:, i] / scales[0][i], piece.u / scales[1]) for piece in pieces], first) for pieces in (training, held_out)
-        ]
-        if not all(part.pieces for part in parts):
-            raise InputError(f"no stretch of the record is longer than {2 * max(first, LONG)} samples, so no model can be identified")
-        structure, values = choose(*parts, n_u, params)
-        whole = Record([*parts[0].pieces, *parts[1].pieces], first)
+        training, held_out = (Record.of(pieces, i, scales, params) for pieces in parts)
+        if not (training.pieces and held_out.pieces):
+            raise InputError(f"no stretch of the record is longer than {2 * training.first} samples, so no model can be identified")
+        structure, values = choose(training, held_out, n_u, params)
+        whole = Record([*training.pieces, *held_out.pieces], training.first)
         parameters = whole.fit(structure)
         spread = spread_of(whole, structure, parameters)
         equations.append(Equation(structure, parameters, spread))
@@ -463,13 +468,13 @@ def identify(
         ensembles.append(drawn)
         if (value := whiteness(whole.errors(structure, parameters), params)) < params.white:
             warnings.append(
-                f"the residuals of {name} are not white (p = {value:.1g}) for any model up to order {max(params.orders)}: there is a "
-                f"disturbance or a dynamic that the model does not have"
+                f"the residuals of {name} are not white (p = {value:.1g}) for any model up to order {max(params.orders)}: there is "
+                f"a disturbance or a dynamic that the model does not have"
             )
-    warnings += [f"the data do not tell an effect of {name} on any output from none" for name, seen in zip(names[1], told, strict=True) if not seen]
-    return Identified(
-        tuple(equations), assemble([equations], scales), tuple(zip(*ensembles, strict=True)), scales, tuple(candidates), tuple(warnings)
-    )
+    untold = [name for name, seen in zip(names[1], told, strict=True) if not seen]
+    warnings += [f"the data do not tell an effect of {name} on any output from none" for name in untold]
+    members_of = tuple(zip(*ensembles, strict=True))
+    return Identified(tuple(equations), assemble([equations], scales), members_of, scales, tuple(candidates), tuple(warnings))
 
 
 def effects(record: Record, structure: Structure, parameters: Array) -> NDArray[np.bool_]:
@@ -505,12 +510,10 @@ def validate_model(
 
     A window begins in the state that the model has found by then; after that only the inputs are used.
     """
-    model, (y_scale, u_scale) = identified.nominal, identified.scales
-    first = max(params.orders) + params.longest_dead_time + 1
-    records = [
-        Record([(piece.y[:, i] / y_scale[i], piece.u / u_scale) for piece in pieces], first) for i in range(len(y_scale))
-    ]
-    errors = [record.errors(equation.structure, equation.parameters) for record, equation in zip(records, identified.equations, strict=True)]
+    model, y_scale = identified.nominal, identified.scales[0]
+    records = [Record.of(pieces, i, identified.scales, params) for i in range(len(y_scale))]
+    fitted = zip(records, identified.equations, strict=True)
+    errors = [record.errors(equation.structure, equation.parameters) for record, equation in fitted]
     begin, warm = records[0].first, 2 * records[0].first
     measured, states, inputs = [], [], []
     kept = [piece for piece in pieces if len(piece) > warm]

@@ -3,6 +3,7 @@
 The learning is that of the paper's plant; what differs is that a plant shows y alone, so that the features are on y.
 """
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,6 +35,7 @@ from helpers.plant.rollout import stream
 from helpers.plant.task import ControlTask
 from helpers.plant.tracking import Scenarios, Tracked, Tracker, track
 from helpers.runs.progress import ProgressBar
+from helpers.settings.leaf import InputError
 from helpers.settings.paper import FeatureParams, LearningParams, Params, ScaleParams, load
 
 PIECE = 5  # episodes: how long the pieces of a long record are that the model is identified from
@@ -140,7 +142,7 @@ def identify_plant(plant: OwnPlant) -> tuple[Identified, Validation]:
     )
     training, held_out = (thin_out(part, params.longest, PIECE * description.horizon) for part in (first, last))
     names = (plant.controlled, plant.manipulated)
-    identified = identify(training, held_out, scales, names, params, max(4, plant.epochs(params.members)), plant.seed)
+    identified = identify((training, held_out), scales, names, params, max(4, plant.epochs(params.members)), plant.seed)
     return identified, validate_model(identified, held_out, description.horizon, plant.controlled, params)
 
 
@@ -189,7 +191,9 @@ class Workshop:
         """Samples of an episode: long enough for two set point steps."""
         return min(2 * self.plant.description.horizon, self.plant.params.operation.longest)
 
-    def draw(self, models: ArmaxModel, n_episodes: int, generator: torch.Generator, longer: int = 1, quiet: bool = False) -> Scenarios:
+    def draw(
+        self, models: ArmaxModel, n_episodes: int, generator: torch.Generator, longer: int = 1, quiet: bool = False
+    ) -> Scenarios:
         """Episodes of models drawn from these; `longer` than those of training by this factor."""
         drawn = models.members(torch.randint(len(models), (n_episodes,), generator=generator))
         return draw_scenarios(drawn, self.operation, self.plant.params.operation, longer * self.n_steps, generator, quiet)
@@ -212,11 +216,15 @@ def open_workshop(plant: OwnPlant, identified: Identified) -> Workshop:
     record = described_gains(description, dtype) or found
     loops = tuple(torch.nonzero(record.integral.abs().sum(0) > 0).flatten().tolist())
     if not loops:
-        raise InputError(f"{description.title}: no loop with integral action is found in the record: describe its controller under 'pid'")
-    half = max(1, len(identified.members) * 3 // 4)
-    parts = replace(identified, members=identified.members[:half]), replace(identified, members=identified.members[half:] or identified.members)
+        raise InputError(
+            f"{description.title}: no loop with integral action is found in the record: describe its controller under 'pid'"
+        )
+    members, edge = identified.members, max(1, len(identified.members) * 3 // 4)
     n_models = max(16, plant.epochs(params.policy.models))
-    training, held_out = (part.ensemble(params.margins, n_models, plant.seed + k).to(dtype) for k, part in enumerate(parts))
+    training, held_out = (
+        replace(identified, members=part).ensemble(params.margins, n_models, plant.seed + k).to(dtype)
+        for k, part in enumerate((members[:edge], members[edge:]))
+    )
     return Workshop(
         plant, operation(clean, description, loops, dtype), record, explained, identified.nominal.to(dtype), training, held_out
     )  # fmt: skip
@@ -237,12 +245,20 @@ def tune(workshop: Workshop) -> tuple[Gains, PredictiveControl]:
     return gains, tuned_predictive(workshop.nominal, scenarios, workshop.operation, price, params)
 
 
-def learn_policy(workshop: Workshop, start: Gains, purpose: str = "policy") -> tuple[TrackingPolicy, list[GradientRecord]]:
-    """One policy for the whole range, by the gradient through the models; it begins as the PID `start`."""
+def learn_policy(
+    workshop: Workshop, start: Gains | TrackingPolicy, purpose: str = "policy"
+) -> tuple[TrackingPolicy, list[GradientRecord]]:
+    """One policy for the whole range, by the gradient through the models; it begins as the PID or the policy `start`."""
     plant, operation = workshop.plant, workshop.operation
     params, generator = plant.params.policy, plant.stream(purpose)
-    torch.manual_seed(int(torch.randint(2**31, (1,), generator=generator)))  # torch.nn draws the first weights from the global stream
-    policy = TrackingPolicy(plant.learning.policy, start, operation.unit, operation.centre, operation.unit, operation.bounds)
+    torch.manual_seed(
+        int(torch.randint(2**31, (1,), generator=generator))
+    )  # torch.nn draws the first weights from the global stream
+    policy = (
+        TrackingPolicy(plant.learning.policy, start, operation.unit, operation.centre, operation.unit, operation.bounds)
+        if isinstance(start, Gains)
+        else copy.deepcopy(start)
+    )
 
     def measure(scenarios: Scenarios, run: Tracked) -> tuple[Tensor, Tensor]:
         error, movement = workshop.reference(scenarios)

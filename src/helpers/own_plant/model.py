@@ -19,13 +19,13 @@ from helpers.settings.leaf import InputError
 GYMNASIUM = "gymnasium:"
 
 
-@dataclass(frozen=True)
+@dataclass
 class ArmaxModel:
     """Models of a plant side by side, deviation variables; one step is one sample.
 
-    y_{t+1} = W x_t + V u_t + c + e_{t+1} with x_t = (y_t, y_{t-1}, .., u_{t-1}, .., e_t, e_{t-1}, ..): what is measured is a state, and
-    the innovations e carry disturbance and noise of the sensor at once. Their standard deviation has a fixed part and one that
-    grows with the deviation, as in Eq. 4.1.3c and 4.1.4b: s(y)^2 = fixed^2 + (gain y)^2.
+    y_{t+1} = W x_t + V u_t + c + e_{t+1} with x_t = (y_t, y_{t-1}, .., u_{t-1}, .., e_t, e_{t-1}, ..). What is measured is a state,
+    and the innovations e carry disturbance and noise of the sensor at once. Their standard deviation has a fixed part and one
+    that grows with the deviation, as in Eq. 4.1.3c and 4.1.4b: s(y)^2 = fixed^2 + (gain y)^2.
 
     Attributes:
         window: W (M, n_y, n_x). entry: V (M, n_y, n_u). constant: c (M, n_y). spread: fixed part and gain of s, (M, n_y, 2).
@@ -39,20 +39,9 @@ class ArmaxModel:
     lags: int
     taps: int
 
-    @property
-    def n_outputs(self) -> int:
-        """n_y."""
-        return self.entry.shape[1]
-
-    @property
-    def n_inputs(self) -> int:
-        """n_u."""
-        return self.entry.shape[2]
-
-    @property
-    def n_states(self) -> int:
-        """n_x."""
-        return self.window.shape[2]
+    def __post_init__(self) -> None:
+        _, self.n_outputs, self.n_inputs = self.entry.shape
+        self.n_states = self.window.shape[2]
 
     def __len__(self) -> int:
         return len(self.window)
@@ -66,7 +55,7 @@ class ArmaxModel:
         return replace(self, **{name: getattr(self, name).to(dtype) for name in ("window", "entry", "constant", "spread")})
 
     def step(self, x: Tensor, u: Tensor, noise: Tensor) -> Tensor:
-        """The next state, shape (K, n_x), of one model or of one an episode; of the noise (K, n_x) the first n_y columns are used."""
+        """The next state, shape (K, n_x), of one model or of one an episode; of the noise (K, n_x) the first n_y columns count."""
         n_y, n_u = self.n_outputs, self.n_inputs
         y = self.constant + (self.window @ x[..., None] + self.entry @ u[..., None])[..., 0]
         e = (self.spread[..., 0] ** 2 + (self.spread[..., 1] * y) ** 2).sqrt() * noise[:, :n_y]
@@ -92,11 +81,9 @@ class ArmaxModel:
         rows = list(held)
         need = (kept[:, rows][..., rows] @ y[:, rows, None])[..., 0] - self.constant[:, rows]
         u = (torch.linalg.pinv(gain[:, rows]) @ need[..., None])[..., 0]
-        free = [index for index in range(n_y) if index not in rows]
         rest = y.clone()
-        for index in free:
-            drive = (gain[:, index] * u).sum(-1) + self.constant[:, index]
-            rest[:, index] = drive / kept[:, index, index]
+        for index in set(range(n_y)) - set(rows):
+            rest[:, index] = ((gain[:, index] * u).sum(-1) + self.constant[:, index]) / kept[:, index, index]
         x = torch.cat([rest.repeat(1, self.lags), u.repeat(1, self.taps - 1), torch.zeros_like(rest).repeat(1, self.lags)], dim=-1)
         return x, rest, u
 

@@ -6,17 +6,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from helpers.own_plant.description import SECONDS, PlantDescription
+from helpers.learning.tracking_policy import Gains
+from helpers.own_plant.description import PlantDescription
 from helpers.own_plant.model import ArmaxModel
 from helpers.own_plant.quality import CleanRecords
 from helpers.own_plant.settings import OperationParams
 from helpers.plant.tracking import Bounds, Scenarios, Tracked
-from helpers.learning.tracking_policy import Gains
 from helpers.settings.leaf import InputError
 
 SHRUNK = (1.0, 0.8, 0.6, 0.4, 0.2)  # shares of a drawn set point change, of which the first is taken that the inputs can hold
 TINY = 1e-9
-assert SECONDS
 
 
 @dataclass(frozen=True)
@@ -76,10 +75,14 @@ def operation(clean: CleanRecords, description: PlantDescription, loops: tuple[i
     )
 
 
-def targets(models: ArmaxModel, operation: Operation, params: OperationParams, generator: torch.Generator, before: Tensor | None = None) -> Tensor:
+def targets(
+    models: ArmaxModel, operation: Operation, params: OperationParams, generator: torch.Generator, before: Tensor | None = None
+) -> Tensor:
     """Set points within the range that the inputs of each model can hold, (K, n_y); some loops stay where they were before."""
     dtype, n_models = models.entry.dtype, len(models)
-    drawn = operation.low + (operation.high - operation.low) * torch.rand(n_models, len(operation.low), generator=generator, dtype=dtype)
+    drawn = operation.low + (operation.high - operation.low) * torch.rand(
+        n_models, len(operation.low), generator=generator, dtype=dtype
+    )
     if before is not None:
         keep = torch.rand(drawn.shape, generator=generator) < params.still
         moving = torch.randint(len(operation.loops), (n_models,), generator=generator)
@@ -146,7 +149,7 @@ def described_gains(description: PlantDescription, dtype: torch.dtype) -> Gains 
 def recorded_gains(clean: CleanRecords, description: PlantDescription, dtype: torch.dtype) -> tuple[Gains, float]:
     """The PID that explains the moves of the inputs in the record best, one loop an input, and the share of them it explains.
 
-    The velocity form u_t - u_{t-1} = P (e_t - e_{t-1}) + I e_t + D (e_t - 2 e_{t-1} + e_{t-2}) is regressed on the measured errors of one
+    The moves u_t - u_{t-1} = P (e_t - e_{t-1}) + I e_t + D (e_t - 2 e_{t-1} + e_{t-2}) are regressed on the measured errors of one
     output after the other, over samples in automatic whose input is not at a bound.
     """
     table = clean.table

@@ -22,8 +22,8 @@ def side_by_side(scenarios: Scenarios, n_copies: int) -> Scenarios:
     assert isinstance(model, ArmaxModel)
     index = torch.arange(len(model)).repeat(n_copies)
     return Scenarios(
-        model.members(index), scenarios.set_point[:, index], scenarios.load[:, index], scenarios.start[index], scenarios.before[index],
-        scenarios.disturbance[:, index], scenarios.noise[:, index],
+        model.members(index), scenarios.set_point[:, index], scenarios.load[:, index], scenarios.start[index],
+        scenarios.before[index], scenarios.disturbance[:, index], scenarios.noise[:, index],
     )  # fmt: skip
 
 
@@ -89,7 +89,7 @@ def tuned_pid(
     def costs(start: dict[str, Tensor], logs: Tensor) -> list[float]:
         n_episodes = scenarios.start.shape[0]
         many = gains(start, logs)
-        spread = Gains(*(getattr(many, kind).repeat_interleave(n_episodes, dim=0) for kind in ("proportional", "integral", "derivative")))
+        spread = Gains(*(value.repeat_interleave(n_episodes, dim=0) for value in vars(many).values()))
         with torch.no_grad():
             run = track(VelocityPID(spread), side_by_side(scenarios, len(logs)), operation.bounds)
         shape = (len(logs), n_episodes)
@@ -118,10 +118,10 @@ def tuned_pid(
 class PredictiveControl:
     """Offset-free predictive control in increments (generalised predictive control, Clarke et al. 1987), its first move clipped.
 
-    It minimises sum_{i=1..N} |(y_sp - y_{t+i}) / unit|^2 + penalty sum_{i=0..N-1} |Delta u_{t+i} / span|^2 along the identified model written in
-    increments, A(q) Delta y = B(q) Delta u + C(q) (1 - kappa q^-1) e: the observer's zero kappa lets the disturbance drift, so that no
-    offset stays. Without bounds the plan is a linear law; a constrained one differs from its clipped form only while an input sits
-    at a bound.
+    It minimises sum_{i=1..N} |(y_sp - y_{t+i}) / unit|^2 + penalty sum_{i=0..N-1} |Delta u_{t+i} / span|^2 along the identified
+    model in increments, A(q) Delta y = B(q) Delta u + C(q) (1 - kappa q^-1) e: the observer's zero kappa lets the disturbance
+    drift, so that no offset stays. Without bounds the plan is a linear law; a constrained one differs from its clipped form only
+    while an input sits at a bound.
 
     Args:
         model: one member. horizon: N, samples.
@@ -136,7 +136,9 @@ class PredictiveControl:
         drifting[:, 1:] -= kappa * one
         padded = torch.cat([own, torch.zeros(n_y, n_y, dtype=own.dtype)], dim=-1)
         window = torch.cat([padded, inputs, drifting[:, 1:].flatten(1)], dim=-1)
-        self.model = ArmaxModel(window[None], model.entry.double()[:1], torch.zeros(1, n_y).double(), torch.zeros(1, n_y, 2).double(), lags + 1, taps)
+        self.model = ArmaxModel(
+            window[None], model.entry.double()[:1], torch.zeros(1, n_y).double(), torch.zeros(1, n_y, 2).double(), lags + 1, taps
+        )
         self.operation, loops = operation, list(operation.loops)
         n_x = self.model.n_states
         x, still = torch.eye(n_x, dtype=own.dtype), torch.zeros(n_x, n_u, dtype=own.dtype)
@@ -162,23 +164,23 @@ class PredictiveControl:
         self.on_error = self.on_error.to(dtype)
         self.model = self.model.to(dtype)
 
-    def start(self, n_trajectories: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """At rest: the window of increments, the output and the input before (nan: none yet), and the move before."""
+    def start(self, n_trajectories: int) -> tuple[Tensor, Tensor, Tensor]:
+        """At rest: the window of increments, and the output and the input before (nan: none yet)."""
+        zero, nan = self.on_state.new_zeros, torch.nan
         n_y, n_u = self.model.n_outputs, self.model.n_inputs
-        zero = self.on_state.new_zeros
-        return zero(n_trajectories, self.model.n_states), zero(n_trajectories, n_y) * torch.nan, zero(n_trajectories, n_u) * torch.nan, zero(0)
+        return zero(n_trajectories, self.model.n_states), zero(n_trajectories, n_y) + nan, zero(n_trajectories, n_u) + nan
 
-    def act(self, y: Tensor, set_point: Tensor, u_previous: Tensor, memory: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, ...]]:
+    def act(
+        self, y: Tensor, set_point: Tensor, u_previous: Tensor, memory: tuple[Tensor, Tensor, Tensor]
+    ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
         """The first move of the plan made at this sample."""
-        x, y_before, u_before, _ = memory
+        x, y_before, u_before = memory
         n_y, lags = self.model.n_outputs, self.model.lags
         change, move = torch.nan_to_num(y - y_before), torch.nan_to_num(u_previous - u_before)
         x = self.model.step(x, move, torch.zeros_like(x))
-        x = x.clone()
         x[:, -n_y * lags :][:, :n_y] = change - x[:, :n_y]  # the innovation
         x[:, :n_y] = change
-        command = u_previous + (set_point - y) @ self.on_error.T - x @ self.on_state.T
-        return command, (x, y, u_previous, x)
+        return u_previous + (set_point - y) @ self.on_error.T - x @ self.on_state.T, (x, y, u_previous)
 
 
 def tuned_predictive(

@@ -82,6 +82,15 @@ class GateParams(Record):
     close: Annotated[Share, Leaf("share")]
 
 
+class PlantOnlineParams(Record):
+    """The few episodes of the plant itself, where something stands for it."""
+
+    explore: Annotated[Count, Leaf("episodes")]
+    test: Annotated[Count, Leaf("episodes")]
+    disturbance: Annotated[Share, Leaf("input range")]
+    level: Annotated[Share, Leaf("-")]
+
+
 class PlantLearningParams(Record):
     """How long the paper's offline learning lasts."""
 
@@ -100,6 +109,7 @@ class OwnPlantParams(Record):
     rivals: RivalParams
     policy: PlantPolicyParams
     gate: GateParams
+    online: PlantOnlineParams
     learning: PlantLearningParams
 
 

@@ -1,4 +1,4 @@
-"""Closed loops whose set points move: episodes with set points, loads and a model of their own, for controllers of a whole range."""
+"""Closed loops whose set points move: episodes with set points, loads and a model of their own."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -57,7 +57,7 @@ class Scenarios:
 
 @dataclass(frozen=True)
 class Tracked:
-    """Closed loops: x and y at t = 0..T, (T + 1, K, n), u within its bounds (T, K, n_u), the input `before` them, the set points."""
+    """Closed loops: x and y at t = 0..T, (T + 1, K, n), u within its bounds (T, K, n_u), the input before, the set points."""
 
     x: Tensor
     y: Tensor

@@ -1,23 +1,38 @@
 """What the path from a historian file to a controller shows: data quality, the model on held-out records, the responses."""
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 import pandas as pd
+import seaborn
+import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, ScalarFormatter
 from statsmodels.tsa.stattools import acf
 
-from helpers.own_plant.description import ControlledVariable, PlantDescription, Variable
+from helpers.learning.model_gradient import GradientRecord
+from helpers.own_plant.description import PlantDescription, Variable
+from helpers.own_plant.gate import POLICY, RECORD, SIMPLEST, Verdict
 from helpers.own_plant.identify import Validation
+from helpers.own_plant.learn import Workshop
 from helpers.own_plant.quality import CleanRecords
-from helpers.report.figures import COLOURS, INK, LINE_STYLES, SET_POINT, WIDTH, empty_figure
+from helpers.plant.tracking import Tracker, track
+from helpers.report.figures import COLOURS, INK, LINE_STYLES, LOOP_COLOURS, SET_POINT, WIDTH, empty_figure
 from helpers.report.tables import symbol
-from helpers.settings.leaf import DEVIATION
 
 MEASURED, SIMULATED = COLOURS["controlled", "expert"], COLOURS["controlled", "agent"]
 LEFT_OUT, BY_HAND = "#d9d9d9", "#fde0b5"
 MODE_COLOURS = {"manual": BY_HAND, "hold": LEFT_OUT, "PID": "#d5ecd4"}
+CANDIDATES = ("#6e6e6e", LOOP_COLOURS[4], LOOP_COLOURS[2], LOOP_COLOURS[0])  # in the order of `gate.SIMPLEST`
+SHARES = {"mean |e|": "mean |e|, share of the record's PID's", "movement": "movement, share of the record's PID's"}
+CURVES = {
+    "cost": "mean |e|, share of the record's PID's",
+    "movement": "movement, share of what is allowed",
+    "price": "price on movement",
+}
 MOST_POINTS = 4000  # of a line: more cannot be told apart on a page
 
 
@@ -50,10 +65,7 @@ def quality_figure(clean: CleanRecords, description: PlantDescription, first: in
             low, high = axis.get_ylim()
             axis.fill_between(sample, low, high, where=mask.to_numpy(), color=shade, linewidth=0, zorder=0, label=label)
             axis.set_ylim(low, high)
-        words = variable.description or variable.name
-        axis.set_title(f"{words[:1].upper()}{words[1:]} ({variable.tag})", loc="left")
-        axis.set_ylabel(variable.unit)
-        axis.set_label(variable.tag)
+        _title(axis, variable)
     axes[-1].set_xlabel("sample")
     axes[-1].set_xlim(sample[0], sample[-1])
     axes[-1].xaxis.set_major_locator(MaxNLocator(8, integer=True))
@@ -63,37 +75,67 @@ def quality_figure(clean: CleanRecords, description: PlantDescription, first: in
     return figure
 
 
-def response_figure(response: pd.DataFrame, description: PlantDescription) -> Figure:
-    """Controlled variables above, inputs below, under a policy and as recorded: mean and standard deviation, engineering units.
-
-    Args:
-        response: of `stages.response_table`, the policy as the agent and the record as the expert; deviation variables.
-    """
-    rows = {"controlled": description.controlled, "manipulated": description.manipulated}
-    n_columns = max(len(variables) for variables in rows.values())
-    figure = empty_figure(max(WIDTH, WIDTH / 2 * n_columns), 5.6)
-    grid = figure.subplots(2, n_columns, sharex=True, squeeze=False)
-    for axes, (kind, variables) in zip(grid, rows.items(), strict=True):
-        for axis in axes[len(variables) :]:
-            axis.set_visible(False)
-        for axis, variable in zip(axes, variables, strict=False):
-            words = variable.description or variable.name
-            for controller, source in (("expert", "record"), ("agent", "policy")):
-                label = source if kind == "controlled" else f"{source}, input"
-                lines = response[(response["variable"] == variable.name) & (response["controller"] == controller)]
-                mean, time, colour = lines["mean"] + variable.steady_state, lines["time_index"], COLOURS[kind, controller]
-                steps, step = ("steps-post", "post") if kind == "manipulated" else ("default", None)
-                axis.plot(time, mean, color=colour, linestyle=LINE_STYLES[controller], drawstyle=steps, label=label)
-                axis.fill_between(time, mean - lines["std"], mean + lines["std"], color=colour, alpha=0.2, linewidth=0, step=step)
-            if isinstance(variable, ControlledVariable):
-                axis.axhline(variable.set_point, color=SET_POINT, linestyle=LINE_STYLES["set point"], label="set point")
-            axis.set_title(f"{words[:1].upper()}{words[1:]} ({variable.tag})", loc="left")
-            axis.set_ylabel(variable.unit)
-            axis.set_xlabel("sample" if kind == "manipulated" else "")
-            axis.set_label(variable.name)
-    handles = [handle for axes in grid for handle in axes[0].get_legend_handles_labels()[0]]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+def loops_figure(workshop: Workshop, candidates: Mapping[str, Tracker], description: PlantDescription) -> Figure:
+    """One episode of a model held out under every controller, a panel for each variable; engineering units."""
+    scenarios = workshop.draw(workshop.held_out, 1, workshop.plant.stream("figure"))
+    with torch.no_grad():
+        runs = {name: track(tracker, scenarios, workshop.operation.bounds) for name, tracker in candidates.items()}
+    variables: list[Variable] = [*description.controlled, *description.manipulated]
+    figure = empty_figure(WIDTH, 1.7 * len(variables) + 0.7)
+    axes = figure.subplots(len(variables), 1, sharex=True, squeeze=False)[:, 0]
+    for index, (axis, variable) in enumerate(zip(axes, variables, strict=True)):
+        controlled, place = index < len(description.controlled), index % len(description.controlled)
+        place = index if controlled else index - len(description.controlled)
+        if place in workshop.operation.loops and controlled:
+            aim = scenarios.set_point[:, 0, place].double() + variable.steady_state
+            axis.plot(aim, color=SET_POINT, linestyle=LINE_STYLES["set point"], drawstyle="steps-post", label="set point")
+        for (name, run), colour in zip(runs.items(), CANDIDATES, strict=False):
+            signal = (run.y if controlled else run.u)[:, 0, place].double() + variable.steady_state
+            style, width = "default" if controlled else "steps-post", 1.8 if name == POLICY else 1.1
+            axis.plot(signal, color=colour, drawstyle=style, linewidth=width, label=name)
+        _title(axis, variable)
+    axes[-1].set_xlabel("sample")
+    figure.legend(handles=axes[0].get_legend_handles_labels()[0], loc="outside lower center", ncols=5, frameon=False)
     return figure
+
+
+def gate_figure(verdict: Verdict) -> Figure:
+    """Every episode of the gate: mean |e| and movement of each controller as shares of those of the record's PID."""
+    figure = empty_figure(WIDTH, 3.4)
+    for axis, (what, label) in zip(figure.subplots(1, 2), SHARES.items(), strict=True):
+        frame = verdict.episodes[verdict.episodes["controller"] != RECORD]
+        order = [name for name in SIMPLEST if name != RECORD]
+        seaborn.boxenplot(
+            frame, x=what, y="controller", hue="controller", order=order, hue_order=order, palette=list(CANDIDATES[1:]),
+            legend=False, log_scale=True, ax=axis,
+        )  # fmt: skip
+        axis.axvline(1.0, color=INK, linewidth=1.0, linestyle="--")
+        axis.set_xlabel(label)
+        axis.set_ylabel("")
+        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.xaxis.set_major_formatter(ScalarFormatter())
+        axis.xaxis.set_minor_locator(NullLocator())
+    return figure
+
+
+def progress_figure(records: Sequence[GradientRecord]) -> Figure:
+    """Cost, movement and its price over the gradient steps."""
+    frame = pd.DataFrame([vars(record) for record in records]).rename(columns=CURVES)
+    figure = empty_figure(WIDTH, 3.0)
+    for axis, (name, level) in zip(figure.subplots(1, 3), zip(CURVES.values(), (1.0, 1.0, None), strict=True), strict=True):
+        axis.plot(frame.index + 1, frame[name], color=SIMULATED, linewidth=1.0)
+        if level is not None:
+            axis.axhline(level, color=INK, linewidth=1.0, linestyle="--")
+        axis.set_title(name, loc="left")
+        axis.set_xlabel("gradient step")
+    return figure
+
+
+def _title(axis: Axes, variable: Variable) -> None:
+    words = variable.description or variable.name
+    axis.set_title(f"{words[:1].upper()}{words[1:]} ({variable.tag})", loc="left")
+    axis.set_ylabel(variable.unit)
+    axis.set_label(variable.name)
 
 
 def validation_figure(validation: Validation, description: PlantDescription, window: int = 0) -> Figure:
@@ -109,10 +151,10 @@ def validation_figure(validation: Validation, description: PlantDescription, win
             f"{symbol(variable.name)}: fit {100 * validation.fit[index]:.0f} % over {len(validation.measured)} windows", loc="left"
         )
         left.set_ylabel(f"deviation, {variable.unit}")
-        values = acf(validation.residuals[:, index], nlags=20)[1:]
+        values = acf(validation.residuals[index], nlags=20)[1:]
         right.axhspan(
-            -1.96 / len(validation.residuals) ** 0.5,
-            1.96 / len(validation.residuals) ** 0.5,
+            -1.96 / len(validation.residuals[index]) ** 0.5,
+            1.96 / len(validation.residuals[index]) ** 0.5,
             color=LEFT_OUT,
             label="95 % of white noise",
         )
@@ -128,17 +170,6 @@ def validation_figure(validation: Validation, description: PlantDescription, win
     axes[-1, 1].set_xlabel("lag (samples)")
     handles = [*axes[0, 0].get_legend_handles_labels()[0], *axes[0, 1].get_legend_handles_labels()[0]]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
-    return figure
-
-
-def with_units(figure: Figure, description: PlantDescription) -> Figure:
-    """A figure of responses with the units of this plant; its panels carry the name of their variable as label."""
-    words = {variable.name: variable.unit for variable in (*description.controlled, *description.manipulated)}
-    for axis in figure.axes:
-        names = [name for name in str(axis.get_label()).split() if name in words]
-        if names:
-            label = axis.get_ylabel().replace("\n", " ").replace(DEVIATION, f"deviation, {words[names[0]]}")
-            axis.set_ylabel(label)
     return figure
 
 
@@ -172,10 +203,7 @@ def guard_figure(steps: pd.DataFrame, description: PlantDescription) -> Figure:
             where = (here | here.shift(fill_value=False)).to_numpy()
             axis.fill_between(sample, low, high, where=where, color=shade, linewidth=0, zorder=0, step="post", label=mode)
         axis.set_ylim(low, high)
-        words = variable.description or variable.name
-        axis.set_title(f"{words[:1].upper()}{words[1:]} ({variable.name})", loc="left")
-        axis.set_ylabel(variable.unit)
-        axis.set_label(variable.name)
+        _title(axis, variable)
     axes[-1].set_xlabel("sample")
     axes[-1].set_xlim(sample[0], sample[-1])
     handles = [Patch(color=shade, label=mode) for mode, shade in MODE_COLOURS.items()]

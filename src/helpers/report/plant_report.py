@@ -1,10 +1,11 @@
 """From a historian file to a controller in one command: `python -m helpers plant plant.yaml --output folder`.
 
-It reads, repairs, identifies, learns, exports, and writes a report of all that. Nothing is applied to a plant.
+It reads, repairs, identifies, tunes the rivals, learns one policy for the range of the record, and judges all on models held out.
+Only a policy that passes is exported. Nothing is applied to a plant.
 """
 
 import argparse
-import copy
+import shutil
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,162 +15,173 @@ import pandas as pd
 import torch
 from matplotlib.figure import Figure
 
-from helpers.learning.evaluation import feature_gap
-from helpers.learning.policy import LSTMPolicy
-from helpers.own_plant.deploy import DeployedPolicy, disagreement, export
+from helpers.learning.learner import TrainingError
+from helpers.learning.tracking_policy import TrackingPolicy, VelocityPID
+from helpers.own_plant.deploy import STATIC, DeployedPolicy, disagreement, export, export_c
+from helpers.own_plant.gate import POLICY, PREDICTIVE, RECORD, TUNED
 from helpers.own_plant.learn import (
     OwnPlant,
-    as_measured,
-    compare,
+    Workshop,
     history,
     identify_plant,
-    improve_on,
-    judge,
     learn_offline,
+    learn_policy,
     open_plant,
-    task_at_rest,
+    open_workshop,
+    parameter_table,
+    pass_gate,
     task_on,
-    transfer,
+    tune,
 )
 from helpers.own_plant.model import load_plant
-from helpers.plant.process import Process
-from helpers.plant.task import ControlTask, Trajectories
-from helpers.report.figures import DPI_FILE, learning_curves
-from helpers.report.plant_figures import quality_figure, response_figure, validation_figure
+from helpers.own_plant.online import improve_on_plant
+from helpers.plant.tracking import Tracker, track
+from helpers.report.figures import DPI_FILE
+from helpers.report.plant_figures import gate_figure, loops_figure, progress_figure, quality_figure, validation_figure
 from helpers.runs.request import check_place
 from helpers.runs.scratch import beside, sweep
 from helpers.runs.sources import PROJECT
-from helpers.runs.stages import response_table
 from helpers.settings.leaf import InputError
 from helpers.settings.paper import load
 
 AGREEMENT = 1e-5  # of the input range, between the exported policy and torch
+NAMES = ("policy.onnx", f"policy{STATIC}.onnx", "policy.c", "report.md")  # what the command writes beside its figures
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the command found; tables and figures by name, and the sentences of the report."""
+    """What the command found; tables and figures by name, and the sentences of the report, the verdict first."""
 
     tables: dict[str, pd.DataFrame]
     figures: dict[str, Figure]
     sentences: tuple[str, ...]
 
 
-def notes(plant: OwnPlant) -> dict[str, object]:
+def notes(workshop: Workshop) -> dict[str, object]:
     """What a policy file tells about itself."""
-    description = plant.description
+    description, operation = workshop.plant.description, workshop.operation
     keys = {"name", "tag", "unit", "low", "high", "steady_state"}
+    ends = torch.stack([operation.low, operation.high], dim=-1).double() + description.steady("controlled")[:, None]
     return {
         "title": description.title,
         "sampling_time": [description.sampling_time, description.time_unit],
-        "controlled": [variable.model_dump(include=keys | {"set_point"}) for variable in description.controlled],
+        "controlled": [variable.model_dump(include=keys) for variable in description.controlled],
         "manipulated": [variable.model_dump(include=keys) for variable in description.manipulated],
+        "set_point_range": [
+            [float(low), float(high)] if index in operation.loops else [variable.low, variable.high]
+            for index, ((low, high), variable) in enumerate(zip(ends, description.controlled, strict=True))
+        ],
     }
 
 
-def export_policy(plant: OwnPlant, policy: LSTMPolicy, process: Process, task: ControlTask, path: Path) -> float:
-    """Write the policy as ONNX and check it over whole episodes; the greatest disagreement, as a share of the input range.
+def export_policy(workshop: Workshop, policy: TrackingPolicy, folder: Path) -> float:
+    """Write policy.onnx, the same with batch 1 and fixed shapes, and as C source; the greatest disagreement with torch.
+
+    Returns:
+        Over whole episodes, as a share of the input range.
 
     Raises:
-        InputError: if file and policy disagree; what was at `path` before stays.
+        InputError: if file and policy disagree.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    sweep(path)
-    partial = beside(path)
-    steady = plant.description.steady("controlled"), plant.description.steady("manipulated")
-    batch = compare(plant, process, task, {"policy": policy})["policy"]
-    try:
-        export(policy, task, *steady, partial, notes(plant))
-        worst = disagreement(policy, DeployedPolicy(partial), task, batch.y, batch.u, *steady)
-        if not worst <= AGREEMENT:  # nan is not
-            raise InputError(f"{path}: the exported policy differs from the learned one by {worst:.1g} of the input range")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    description = workshop.plant.description
+    steady = description.steady("controlled"), description.steady("manipulated")
+    paths = [folder / name for name in NAMES[:3]]
+    for path, static in zip(paths, (False, True), strict=False):
+        export(policy, *steady, path, notes(workshop), static)
+    export_c(paths[1], paths[2])
+    scenarios = workshop.draw(workshop.held_out, 20, workshop.plant.stream("export"))
+    with torch.no_grad():
+        run = track(policy, scenarios, workshop.operation.bounds)
+    worst = disagreement(policy, DeployedPolicy(paths[0]), run.y[:-1], run.set_point, *steady)
+    if not worst <= AGREEMENT:  # nan is not
+        raise InputError(f"{paths[0]}: the exported policy differs from the learned one by {worst:.1g} of the input range")
     return worst
 
 
-def exported(plant: OwnPlant, policy: LSTMPolicy, process: Process, task: ControlTask, path: Path) -> str:
-    """`export_policy` as a sentence of the report."""
-    worst = export_policy(plant, policy, process, task, path)
-    return f"{path.name} agrees with the learned policy to {worst:.1g} of the input range over whole episodes"
+def offline(plant: OwnPlant, workshop: Workshop) -> tuple[dict[str, pd.DataFrame], str]:
+    """What the record's controller was after, by Algorithm 2: the table of its weights, and a sentence."""
+    model = workshop.nominal.to(plant.dtype)
+    try:
+        found = learn_offline(plant, model, task_on(plant, model))
+    except TrainingError as error:
+        return {}, f"the weights of the record's controller were not found: {error}"
+    weights = pd.DataFrame({"alpha*": found.weights.tolist()}, index=plant.feature_names)
+    gap = history(found.records, plant.feature_names)["feature_gap"].min()
+    return {"Reward weights": weights}, f"Algorithm 2 matches the features of the record to {100 * gap:.1f} %"
 
 
-def beside_the_record(plant: OwnPlant, batch: Trajectories) -> Figure:
-    """The response under a policy beside the recorded one."""
-    recorded = plant.demonstrations.trajectories
-    response = response_table(as_measured(batch), as_measured(recorded), plant.controlled, plant.manipulated)
-    return response_figure(response, plant.description)
-
-
-def run(path: Path, output: Path, params_root: Path, scale: str, seed: int) -> Outcome:
-    """The whole chain for one description; writes into `output`.
-
-    What the plant, the transfer or the folder may lack is found before anything is learned.
+def work(path: Path, folder: Path, params_root: Path, scale: str, seed: int) -> tuple[str, Outcome]:
+    """The whole chain for one description; policy files go into `folder`. Returns the title and what was found.
 
     Raises:
-        InputError: in one sentence, if something that was given cannot be used. OSError: if `output` cannot be written.
+        InputError: in one sentence, if something that was given cannot be used. OSError: if `folder` cannot be written.
     """
     params = load(params_root, 1)
     torch.set_num_threads(params.learning.scales[scale].threads)
     plant = open_plant(path, params_root, scale, seed, params)
-    name = plant.description.plant
+    name, found = plant.description.plant, plant.demonstrations
     given = load_plant(name, plant.description) if name else None
-    if plant.description.transfer:
-        plant.with_set_points(plant.description.transfer)  # for its refusals alone
-    output.mkdir(parents=True, exist_ok=True)
-    found = plant.demonstrations
+    identified, validation = identify_plant(plant)
+    workshop = open_workshop(plant, identified)
+    tuned, predictive = tune(workshop)
+    policy, records = learn_policy(workshop, tuned)
+    candidates: dict[str, Tracker] = {
+        RECORD: VelocityPID(workshop.record), TUNED: VelocityPID(tuned), PREDICTIVE: predictive, POLICY: policy
+    }  # fmt: skip
+    verdict = pass_gate(workshop, candidates)
     sentences = [
+        verdict.words,
         f"{len(plant.clean.table)} samples, {len(plant.clean.findings)} findings, {found.trajectories.n_trajectories} episodes of "
         f"{plant.description.horizon} samples",
         *(f"left out: {number} episodes ({reason})" for reason, number in found.left_out.items() if number),
+        f"the controller of the record: {'as described' if plant.description.pid else 'a PID found in it'}, which explains "
+        f"{100 * workshop.explained:.0f} % of the moves of its inputs",
+        *(f"warning: {words}" for words in (*identified.warnings, *validation.warnings)),
     ]
-    identified, validation = identify_plant(plant)
-    sentences += [f"warning: {words}" for words in (*identified.warnings, *validation.warnings)]
-    model = identified.model.to(plant.dtype)
-    task = task_on(plant, model)
-    offline = learn_offline(plant, model, task)
-    process: Process = model if given is None else given
-    sentences.append(f"online learning ran on {name}" if name else "online learning ran on the identified model: no plant is named")
-    plant_task = task_at_rest(plant, process) if name else task
-    online, _ = improve_on(plant, copy.deepcopy(offline.policy), process, plant_task)
-    batches = compare(plant, process, plant_task, {"offline": offline.policy, "online": online})
-    features = plant.features(plant_task)
-    recorded = judge(plant, plant_task, {"record": found.trajectories, **batches})
-    gap = feature_gap(features.trajectory(batches["offline"]).mean(0), features.trajectory(found.trajectories).mean(0))
-    sentences.append(f"feature gap between the offline policy and the record: {100 * gap:.1f} %")
-    sentences.append(exported(plant, online, process, plant_task, output / "policy.onnx"))
-    fit = pd.DataFrame({"fit": validation.fit, "Ljung-Box p": validation.p_value}, index=list(plant.controlled))
-    weights = pd.DataFrame({"alpha*": offline.weights.tolist()}, index=plant.feature_names)
-    tables = {
-        "Data quality": plant.clean.section(),
-        "Model on held-out records": fit,
-        "Reward weights": weights,
-        "Controllers": recorded,
-    }
-    learned = history(offline.records, plant.feature_names)
+    if verdict.released:
+        if given is not None:
+            improvement = improve_on_plant(workshop, identified, policy, given)
+            candidates[POLICY] = policy = improvement.policy
+            sentences.append(improvement.words)
+        worst = export_policy(workshop, policy, folder)
+        sentences.append(f"policy.onnx agrees with the learned policy to {worst:.1g} of the input range over whole episodes")
+    tables, words = offline(plant, workshop)
+    quality = plant.clean.section()
+    fit = parameter_table(plant, identified).assign(**{"fit held out": validation.fit, "Ljung-Box p": validation.p_value})
+    tables = {"Controllers on models held out": verdict.table, "Model": fit.T, **tables, "Data quality": quality}
     figures = {
-        "quality": quality_figure(plant.clean, plant.description),
+        "gate": gate_figure(verdict),
+        "loops": loops_figure(workshop, candidates, plant.description),
+        "learning": progress_figure(records),
         "model": validation_figure(validation, plant.description),
-        "learning": learning_curves(learned),
-        "response": beside_the_record(plant, batches["online"]),
+        "quality": quality_figure(plant.clean, plant.description),
     }
-    if plant.description.transfer:
-        moved = transfer(plant, offline, model, process, plant.description.transfer)
-        policies = {"before": offline.policy, "transferred": moved.offline.policy, "online": moved.online}
-        batches = compare(moved.plant, process, moved.task, policies)
-        batches = {"record": moved.plant.demonstrations.trajectories, **batches}
-        tables["Controllers after the transfer"] = judge(moved.plant, moved.task, batches)
-        figures["response_transfer"] = beside_the_record(moved.plant, batches["online"])
-        sentences.append(exported(moved.plant, moved.online, process, moved.task, output / "policy_transfer.onnx"))
-    outcome = Outcome(tables, figures, tuple(sentences))
-    write(outcome, plant.description.title, output)
+    return plant.description.title, Outcome(tables, figures, (*sentences, words))
+
+
+def run(path: Path, output: Path, params_root: Path, scale: str, seed: int) -> Outcome:
+    """`work`, and its report; `output` changes only when all is there, and holds a policy only beside the report on it."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    sweep(output)
+    partial = beside(output)
+    try:
+        partial.mkdir()
+        title, outcome = work(path, partial, params_root, scale, seed)
+        write(outcome, title, partial)
+        output.mkdir(exist_ok=True)
+        for name in NAMES:
+            (output / name).unlink(missing_ok=True)
+        for file in sorted(partial.iterdir(), key=lambda file: NAMES.index(file.name) if file.name in NAMES else -1):
+            file.replace(output / file.name)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
     return outcome
 
 
 def write(outcome: Outcome, title: str, output: Path) -> None:
-    """report.md with its figures beside it."""
-    parts = [f"# {title}", *(f"- {sentence}" for sentence in outcome.sentences)]
+    """report.md with its figures beside it; the first line is the verdict."""
+    verdict, *others = outcome.sentences
+    parts = [f"**{verdict[:1].upper()}{verdict[1:]}.**", "", f"# {title}", "", *(f"- {sentence}" for sentence in others)]
     for name, table in outcome.tables.items():
         parts += ["", f"## {name}", "", table.to_markdown(floatfmt=".4g", index=name != "Data quality")]
     for name, figure in outcome.figures.items():
@@ -190,12 +202,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         check_place("output", given.output)
         outcome = run(given.description, given.output, given.params, given.scale, given.seed)
-    except InputError as error:
+    except (InputError, TrainingError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except OSError as error:
         print(f"error: {error.filename or given.output}: {error.strerror or error}", file=sys.stderr)
         return 1
     print("\n".join(outcome.sentences))
-    print(f"written: {given.output / 'report.md'}, its figures and policies beside it")
+    released = (given.output / NAMES[0]).is_file()
+    print(f"written: {given.output / 'report.md'}, its figures{' and the policy' if released else ''} beside it")
     return 0

@@ -1,0 +1,110 @@
+"""A few episodes of the plant itself: explore gently, identify again, improve through the new models, take over only if better."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.stats import ttest_rel
+from torch import Tensor
+
+from helpers.learning.tracking_policy import TrackingPolicy, VelocityPID
+from helpers.own_plant.episodes import Stretch
+from helpers.own_plant.identify import Identified, identify
+from helpers.own_plant.learn import Workshop, learn_policy, open_workshop
+from helpers.plant.process import Process
+from helpers.plant.tracking import Scenarios, track
+
+
+@dataclass(frozen=True)
+class Exploring:
+    """A policy whose command is disturbed, so that the plant shows more of itself.
+
+    Attributes:
+        policy: what is disturbed. size: of the disturbance, standard deviation (n_u,).
+    """
+
+    policy: TrackingPolicy
+    size: Tensor
+    generator: torch.Generator
+
+    def start(self, n_trajectories: int) -> Any:
+        """The policy's."""
+        return self.policy.start(n_trajectories)
+
+    def act(self, y: Tensor, set_point: Tensor, u_previous: Tensor, memory: Any) -> tuple[Tensor, Any]:
+        """The policy's command and a normal disturbance."""
+        command, memory = self.policy.act(y, set_point, u_previous, memory)
+        return command + self.size * torch.randn(command.shape, generator=self.generator, dtype=command.dtype), memory
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """What the episodes of the plant brought.
+
+    Attributes:
+        policy: the one to go on with. taken: whether it is the new one. episodes: of the plant, all told.
+        worse: share of the exploring episodes with a greater mean |e| than the record's PID on the same draws.
+        before, after: mean |e| of the old and the new policy on fresh episodes, as shares of the record's PID's. p_value: of the
+            one-sided paired test that the new one is better.
+    """
+
+    policy: TrackingPolicy
+    taken: bool
+    episodes: int
+    worse: float
+    before: float
+    after: float
+    p_value: float
+
+    @property
+    def words(self) -> str:
+        """In a sentence."""
+        return (
+            f"{self.episodes} episodes of the plant: {100 * self.worse:.0f} % of the exploring ones worse than the record's PID; "
+            f"the policy learned after them {'takes over' if self.taken else 'does not take over'} ({100 * self.after:.0f} against "
+            f"{100 * self.before:.0f} % of the record's PID's mean |e| in a paired test, p = {self.p_value:.2g})"
+        )
+
+
+def plant_episodes(workshop: Workshop, process: Process, n_episodes: int, generator: torch.Generator) -> Scenarios:
+    """Episodes of the plant at its steady state, with set points of the range that its nominal model can hold, and a load step."""
+    index = torch.zeros(n_episodes, dtype=torch.long)
+    drawn = workshop.draw(workshop.nominal.members(index[:1]), n_episodes, generator)
+    dtype = workshop.operation.unit.dtype
+    n_steps = len(drawn.set_point)
+    sizes = (n_steps, n_episodes, process.n_states), (n_steps + 1, n_episodes, process.n_outputs)
+    noise = [torch.randn(size, generator=generator, dtype=dtype) for size in sizes]
+    return Scenarios(
+        process, drawn.set_point, drawn.load, torch.zeros(n_episodes, process.n_states, dtype=dtype),
+        torch.zeros(n_episodes, process.n_inputs, dtype=dtype), *noise,
+    )  # fmt: skip
+
+
+def improve_on_plant(workshop: Workshop, identified: Identified, policy: TrackingPolicy, process: Process) -> Improvement:
+    """`explore` + 2 `test` episodes of the plant; the policy that is given stays unless a paired test finds a better one."""
+    plant, operation, params = workshop.plant, workshop.operation, workshop.plant.params.online
+    generator = plant.stream("plant episodes")
+    explored = plant_episodes(workshop, process, params.explore, generator)
+    with torch.no_grad():
+        run = track(Exploring(policy, params.disturbance * operation.bounds.span, generator), explored, operation.bounds)
+        recorded = track(VelocityPID(workshop.record), explored, operation.bounds)
+    worse = (operation.error(run) > operation.error(recorded)).double().mean().item()
+    pieces = [Stretch(y.double().numpy(), u.double().numpy()) for y, u in zip(run.y[:-1].unbind(1), run.u.unbind(1), strict=True)]
+    parts = pieces[: len(pieces) * 3 // 4], pieces[len(pieces) * 3 // 4 :]
+    names, settings = (plant.controlled, plant.manipulated), plant.params.identification
+    again = identify(parts, identified.scales, names, settings, len(identified.members), plant.seed)
+    # What was unknown of the plant has been seen by now; half of the declared margins stays.
+    margins = plant.params.margins
+    narrow = margins.model_copy(update={"gain": margins.gain / 2, "time": margins.time / 2, "dead_time": 0})
+    informed = replace(plant, params=plant.params.model_copy(update={"margins": narrow}))
+    new, _ = learn_policy(replace(open_workshop(informed, again), record=workshop.record, operation=operation), policy, "online")
+    fresh = plant_episodes(workshop, process, params.test, generator)
+    with torch.no_grad():
+        runs = [track(tracker, fresh, operation.bounds) for tracker in (VelocityPID(workshop.record), policy, new)]
+    reference, old, after = (operation.error(each).double() for each in runs)
+    moved = [operation.movement(each).double().mean().item() for each in runs]
+    p_value = float(ttest_rel(np.asarray(after / reference), np.asarray(old / reference), alternative="less").pvalue)
+    taken = p_value < params.level and moved[2] <= plant.params.policy.movement * moved[0]
+    before, since = ((each / reference).mean().item() for each in (old, after))
+    return Improvement(new if taken else policy, taken, params.explore + 2 * params.test, worse, before, since, p_value)

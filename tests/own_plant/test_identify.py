@@ -1,117 +1,164 @@
-"""A model identified from records under feedback: the truth is found, the likelihood rises, and poor data are named."""
+"""A model identified from records under feedback: order, dead times and gains are found, and poor data are named."""
 
 import numpy as np
 import pytest
 import torch
 
 from helpers.own_plant.episodes import Stretch
-from helpers.own_plant.identify import VectorARX, hold_out, identify, thin_out, validate_model
-from helpers.own_plant.model import LinearModel
+from helpers.own_plant.identify import Equation, Margins, Record, Structure, apart, assemble, hold_out, identify, thin_out, validate_model
 from helpers.own_plant.settings import load_own_plant
-from tests.own_plant.plants import MadeUpPlant
+from helpers.settings.leaf import InputError
+from tests.own_plant.plants import Loop
+
+FIRST = ([0.2], [1.0, -0.9])  # gain 2
 
 
 @pytest.fixture(scope="module")
 def params(root):
-    return load_own_plant(root).identification
+    quick = {"orders": (1, 2), "longest_dead_time": 5}
+    return load_own_plant(root).identification.model_copy(update=quick)
 
 
-def record(plant, breaks=(400, 900)):
-    table = plant.table
-    y = table[[f"Y{i}.PV" for i in range(plant.n_controlled)]].to_numpy() - plant.steady_y
-    u = table[[f"U{i}.OP" for i in range(plant.n_manipulated)]].to_numpy() - plant.steady_u
-    return [Stretch(*pair) for pair in zip(np.split(y, breaks), np.split(u, breaks), strict=True)]
+def found(channels, gains, params, **record):
+    y, u = Loop(channels, gains).record(**record)
+    scales = np.ones(len(channels)), np.ones(len(channels[0]))
+    names = [f"y{i}" for i in range(len(channels))], [f"u{j}" for j in range(len(channels[0]))]
+    return identify(hold_out([Stretch(y, u)], 0.25), scales, names, params, members=8, seed=0)
 
 
-def unit_scales(plant):
-    return np.ones(plant.n_controlled), np.ones(plant.n_manipulated)
+def gain(equation):
+    return equation.inputs.sum(1) / (1 - equation.own.sum())
 
 
-def names(plant):
-    return [f"y{i}" for i in range(plant.n_controlled)], [f"u{i}" for i in range(plant.n_manipulated)]
+def delay(equation, j=0):
+    """The dead time up to the first coefficient that counts."""
+    b = equation.inputs[j]
+    return equation.structure.dead_times[j] + int(np.argmax(np.abs(b) > 0.2 * np.abs(b).max()))
 
 
-@pytest.mark.parametrize(("n_y", "n_u"), [(1, 1), (2, 2), (3, 2), (2, 3)])
-def test_the_truth_lies_within_the_standard_errors(n_y, n_u, params):
-    plant = MadeUpPlant(n_y, n_u, n_cycles=60)
-    scales = (np.full(n_y, 0.7), np.full(n_u, 3.0))
-    found = identify(record(plant), scales, names(plant), params, iterations=15)
-    truth = np.hstack([plant.state_step, plant.input_step * 3 / 0.7, np.zeros((n_y, 1))])
-    assert found.lags == 1
-    assert (np.abs(found.parameters - truth) < 5 * found.errors + 0.01).all()
-    assert found.model.state_step.numpy() == pytest.approx(found.parameters[:, :n_y])  # equal scales leave A as it is
-    assert found.model.input_step.numpy() == pytest.approx(found.parameters[:, n_y:-1] * 0.7 / 3)
-    size = (found.model.disturbance**2 + 0.1 * found.model.disturbance_gain**2).sqrt()
-    assert size.numpy() == pytest.approx(0.03, rel=0.5)
-    assert not found.warnings
+@pytest.mark.parametrize("dead", [0, 3])
+def test_a_dead_time_and_a_gain_are_found_under_feedback(dead, params):
+    model = found([[(*FIRST, dead)]], [(0.3, 0.03)], params)
+    (equation,) = model.equations
+    assert delay(equation) == dead
+    assert gain(equation) == pytest.approx([2.0], rel=0.03)
+    assert max(abs(np.roots([1, *-equation.own]))) == pytest.approx(0.9, abs=0.02)
+    assert not model.warnings
 
 
-@pytest.mark.parametrize("lags", [1, 2, 3])
-def test_no_step_lowers_the_likelihood(lags, params):
-    plant = MadeUpPlant(2, 2, n_cycles=10)
-    pieces = record(plant, (150,))
-    y, u = (np.concatenate([getattr(piece, name) for piece in pieces]) for name in "yu")
-    last = np.isin(np.arange(len(y)), [149, len(y) - 1])
-    likelihood = VectorARX(y, u, last, lags)
-    vector, values = likelihood.least_squares(), []
-    for _ in range(12):
-        vector, value, _ = likelihood.expectation_maximisation(vector)
-        values.append(value)
-    assert (np.diff(values) > -1e-6).all()
-    assert values[-1] > values[0]
+def test_each_input_has_a_dead_time_of_its_own(params):
+    channels = [[(*FIRST, 1), ([0.1], [1.0, -0.8], 4)], [([0.05], [1.0, -0.9], 3), ([0.15], [1.0, -0.85], 0)]]
+    model = found(channels, [(0.3, 0.03), (0.4, 0.04)], params)
+    assert [[delay(equation, j) for j in range(2)] for equation in model.equations] == [[1, 4], [3, 0]]
+    assert np.array([gain(equation) for equation in model.equations]) == pytest.approx(np.array([[2.0, 0.5], [0.5, 1.0]]), abs=0.05)
 
 
-def test_a_second_lag_is_found_and_simulated_as_the_state_space_does(params):
-    """A plant with a dead time of one sample: without the second lag of the input its model would be wrong."""
-    rng = np.random.default_rng(1)
-    u = rng.choice([-1.0, 1.0], size=(1500, 1)).repeat(3, axis=0)[:1500]
-    y = np.zeros((1500, 1))
-    for t in range(1, 1500):
-        y[t] = 0.8 * y[t - 1] + (0.5 * u[t - 2] if t > 1 else 0) + 0.05 * rng.normal()
-    pieces = [Stretch(y + 0.02 * rng.normal(size=y.shape), u)]
-    first, last = hold_out(pieces, params.held_out)
-    found = identify(first, (np.ones(1), np.ones(1)), (["y"], ["u"]), params, iterations=15)
-    assert found.lags == 2
-    assert found.parameters[0] == pytest.approx([0.8, 0.0, 0.0, 0.5, 0.0], abs=0.06)
-    checked = validate_model(found, last, 20, ["y"], params)
-    assert checked.fit[0] > 0.85
-    assert checked.p_value[0] > params.white
-    model: LinearModel = found.model
-    assert (model.n_states, model.n_outputs, model.n_inputs) == (3, 1, 1)
-    x, outputs = torch.zeros(1, 3, dtype=torch.float64), []
-    for command in (1.0, 0.0, 0.0):
-        x = model.step(x, torch.tensor([[command]], dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64))
-        outputs.append(x[0, 0].item())
-    a, _, b, late, c = found.parameters[0]
-    assert outputs[0] == pytest.approx(b + c)
-    assert outputs[1] == pytest.approx(a * outputs[0] + late + c)
+def test_an_integrating_plant_is_told_from_a_slow_one(params):
+    (equation,) = found([[([0.05], [1.0, -1.0], 1)]], [(1.0, 0.03)], params).equations
+    assert equation.structure.integrating
+    assert equation.own.sum() == pytest.approx(1.0)
+    assert equation.inputs.sum() / (1 - equation.parameters[: equation.structure.n_own].sum()) == pytest.approx(0.05, rel=0.05)
+    assert not found([[([0.02], [1.0, -0.98], 1)]], [(1.0, 0.03)], params).equations[0].structure.integrating
+
+
+def test_the_poles_of_an_underdamped_plant_are_found(params):
+    poles = 0.9 * np.exp(1j * np.array([0.3, -0.3]))
+    denominator = np.real(np.poly(poles))
+    (equation,) = found([[([0.1 * denominator.sum() * 10], list(denominator), 0)]], [(0.1, 0.02)], params).equations
+    roots = np.roots([1, *-equation.own])
+    assert np.abs(roots[:, None] - poles).min(0) == pytest.approx([0, 0], abs=0.02)
+
+
+def test_the_members_scatter_about_the_truth_and_are_stable(params):
+    model = found([[(*FIRST, 1)]], [(0.3, 0.03)], params)
+    gains = np.array([gain(member[0])[0] for member in model.members])
+    assert 0 < gains.std() < 0.2
+    assert abs(gains.mean() - 2.0) < 4 * gains.std() + 0.02
+    assert all(member[0].growth < 1 for member in model.members)
+
+
+def test_no_step_of_the_fit_raises_the_errors():
+    y, u = Loop([[(*FIRST, 2)]], [(0.3, 0.03)]).record()
+    record, structure = Record([(y[:, 0], u)], 12), Structure(2, (1,))
+    starts = [float(sum((e**2).sum() for e in record.errors(structure, start))) for start in record.starts(structure)]
+    costs = [float(sum((e**2).sum() for e in record.errors(structure, record.fit(structure, steps=n)))) for n in (1, 3, 12)]
+    assert min(starts) >= costs[0] >= costs[1] >= costs[2]
+
+
+def test_margins_change_gain_time_and_dead_time_and_nothing_else():
+    first = Equation(Structure(1, (2,)), np.array([0.9, 0.2, 0.01, -0.5]), np.array([0.1, 0.0]))
+    other = apart(first, Margins(np.array([1.3]), 2.0, (1,)))
+    assert other.structure == Structure(1, (3,))
+    assert other.own == pytest.approx([0.9**0.5])
+    assert gain(other) == pytest.approx(1.3 * gain(first))
+    assert other.constant / (1 - other.own.sum()) == pytest.approx(0.01 / 0.1)
+    same = apart(first, Margins(np.ones(1), 1.0, (0,)))
+    assert same.parameters == pytest.approx(first.parameters)
+
+
+def test_the_model_of_the_equations_is_their_recursion():
+    equations = (
+        Equation(Structure(2, (1, 0)), np.array([0.5, 0.2, 1.0, 2.0, 3.0, 4.0, 0.1, 0.3, 0.4]), np.array([0.5, 0.0])),
+        Equation(Structure(1, (0, 2)), np.array([0.7, 5.0, 6.0, 0.2, -0.6]), np.array([0.0, 0.5])),
+    )
+    model = assemble([equations], (np.ones(2), np.ones(2)))
+    rng = np.random.default_rng(0)
+    u, noise = rng.normal(size=(20, 2)), rng.normal(size=(20, 2))
+    x, y, e = torch.zeros(1, model.n_states, dtype=torch.float64), np.zeros((21, 2)), np.zeros((21, 2))
+
+    def past(signal, t, column):
+        return signal[t, column] if t >= 0 else 0.0
+
+    for t in range(20):
+        kick = torch.zeros(1, model.n_states, dtype=torch.float64)
+        kick[0, :2] = torch.tensor(noise[t])
+        x = model.step(x, torch.tensor(u[t])[None], kick)
+        y0 = 0.5 * y[t, 0] + 0.2 * past(y, t - 1, 0) + past(u, t - 1, 0) + 2 * past(u, t - 2, 0) + 3 * u[t, 1] + 4 * past(u, t - 1, 1)
+        y0 += 0.1 + 0.3 * e[t, 0] + 0.4 * past(e, t - 1, 0)
+        y1 = 0.7 * y[t, 1] + 5 * u[t, 0] + 6 * past(u, t - 2, 1) + 0.2 - 0.6 * e[t, 1]
+        e[t + 1] = 0.5 * noise[t, 0], 0.5 * abs(y1) * noise[t, 1]
+        y[t + 1] = y0 + e[t + 1, 0], y1 + e[t + 1, 1]
+        assert model.observe(x, x)[0].numpy() == pytest.approx(y[t + 1])
+
+
+def test_at_rest_the_undisturbed_model_stays_where_it_is():
+    equations = [
+        [Equation(Structure(2, (1, 3)), np.array([0.5, 0.2, 1.0, 2.0, g, 0.1, 0.1, 0.3, 0.4]), np.ones(2)) for g in (0.3, 2.0)]
+        + [Equation(Structure(1, (0, 2)), np.array([0.7, 5.0, 6.0, 0.2, -0.6]), np.ones(2))]
+    ]
+    model = assemble(equations, (np.ones(3), np.ones(2)))
+    aim = torch.tensor([[1.0, -2.0, 0.0]], dtype=torch.float64)
+    x, y, u = model.at_rest(aim, (0, 1))
+    assert y[0, :2].tolist() == [1.0, -2.0]
+    assert model.step(x, u, torch.zeros_like(x))[0].numpy() == pytest.approx(x[0].numpy())
 
 
 def test_a_disturbance_that_grows_with_the_deviation_is_told_from_a_fixed_one(params):
     rng = np.random.default_rng(2)
     u = rng.choice([-1.0, 1.0], size=(3000, 1)).repeat(20, axis=0)[:3000]
-    rows = {}
-    for kind in ("fixed", "growing"):
+    for size, expected in ((lambda y: 0.1, (0.1, 0.0)), (lambda y: 0.1 * abs(y), (0.0, 0.1))):
         y = np.zeros((3000, 1))
         for t in range(1, 3000):
-            size = 0.1 if kind == "fixed" else 0.1 * abs(y[t - 1, 0])
-            y[t] = 0.9 * y[t - 1] + 0.2 * u[t - 1] + size * rng.normal()
-        model = identify([Stretch(y, u)], (np.ones(1), np.ones(1)), (["y"], ["u"]), params, 10).model
-        rows[kind] = (model.disturbance.item(), model.disturbance_gain.item())
-    assert rows["fixed"] == pytest.approx((0.1, 0.0), abs=0.035)
-    assert rows["growing"] == pytest.approx((0.0, 0.1), abs=0.035)
+            mean = 0.9 * y[t - 1, 0] + 0.2 * u[t - 1, 0]
+            y[t] = mean + size(mean) * rng.normal()
+        model = identify(hold_out([Stretch(y, u)], 0.25), (np.ones(1), np.ones(1)), (["y"], ["u"]), params, 4, 0)
+        assert model.equations[0].spread == pytest.approx(expected, abs=0.035)
 
 
 def test_what_the_data_cannot_carry_is_said(params):
+    y, u = Loop([[(*FIRST, 1)]], [(0.3, 0.03)]).record()
+    idle = np.column_stack([u, 0.1 * np.random.default_rng(0).normal(size=len(u))])
+    model = identify(hold_out([Stretch(y, idle)], 0.25), (np.ones(1), np.ones(2)), (["y"], ["u0", "u1"]), params, 4, 0)
+    assert model.warnings == ("the data do not tell an effect of u1 on any output from none",)
+    good = validate_model(model, [Stretch(y, idle)], 30, ["y"], params)
+    assert good.fit[0] > 0.8
+    assert not good.warnings
     rng = np.random.default_rng(0)
-    plant = MadeUpPlant(1, 1, n_cycles=40)
-    pieces = [Stretch(piece.y, np.column_stack([piece.u, rng.normal(size=len(piece))])) for piece in record(plant)]
-    found = identify(pieces, (np.ones(1), np.ones(2)), (["y0"], ["u0", "u1"]), params, 5)
-    assert found.warnings == ("the data do not tell an effect of u1 on any output from none",)
     noise = [Stretch(rng.normal(size=(600, 1)).cumsum(0) * 0.05, rng.normal(size=(600, 2)))]
-    checked = validate_model(found, noise, 30, ["y0"], params)
-    assert any("unexplained: too much to learn from" in words for words in checked.warnings)
-    assert any("are not white" in words for words in checked.warnings)
+    assert "unexplained: too much to learn from" in validate_model(model, noise, 30, ["y"], params).warnings[0]
+    short = [Stretch(y[:20], idle[:20])]
+    with pytest.raises(InputError, match="no stretch of the record is longer than"):
+        identify((short, short), (np.ones(1), np.ones(2)), (["y"], ["u0", "u1"]), params, 4, 0)
 
 
 def test_the_last_part_is_held_out_and_a_long_record_thinned_out():

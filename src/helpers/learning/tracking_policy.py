@@ -25,24 +25,22 @@ class Gains:
     integral: Tensor
     derivative: Tensor
 
-    def command(self, error: Tensor, memory: tuple[Tensor, Tensor], u_previous: Tensor) -> Tensor:
-        """The PID in velocity form; `memory` holds the errors one and two samples before, each (..., n_y)."""
-        once, twice = memory
-        parts = zip(
-            (self.proportional, self.integral, self.derivative), (error - once, error, error - 2 * once + twice), strict=True
-        )
-        return u_previous + sum((gain @ signal[..., None])[..., 0] for gain, signal in parts)
+    @property
+    def law(self) -> Tensor:
+        """The PID in velocity form as one matrix on (e_t, e_{t-1}, e_{t-2}), shape (..., n_u, 3 n_y)."""
+        p, i, d = self.proportional, self.integral, self.derivative
+        return torch.cat([p + i + d, -p - 2 * d, d], dim=-1)
 
 
 class VelocityPID:
     """A PID in velocity form for many set points; before the first sample the error is zero."""
 
     def __init__(self, gains: Gains) -> None:
-        self.gains = gains
+        self.law = gains.law
 
     def start(self, n_trajectories: int) -> tuple[Tensor, Tensor]:
         """No error before."""
-        zero = self.gains.integral.new_zeros(n_trajectories, self.gains.integral.shape[-1])
+        zero = self.law.new_zeros(n_trajectories, self.law.shape[-1] // 3)
         return zero, zero
 
     def act(
@@ -50,7 +48,8 @@ class VelocityPID:
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """The law at one sample."""
         error = set_point - y
-        return self.gains.command(error, memory, u_previous), (error, memory[0])
+        errors = torch.cat([error, *memory], dim=-1)
+        return u_previous + (self.law @ errors[..., None])[..., 0], (error, memory[0])
 
 
 class TrackingPolicy(nn.Module):
@@ -113,6 +112,7 @@ class TrackingPolicy(nn.Module):
 
     def start(self, n_trajectories: int) -> tuple[Tensor, ...]:
         """Zero: errors one and two samples before, the correction before, and h and c of each layer."""
+        self.law = self.gains.law  # once an episode
         n_u, n_y = self.integral.shape
         widths = [n_y, n_y, n_u, *(width for width in self.params.hidden_cells for _ in "hc")]
         return tuple(self.unit.new_zeros(n_trajectories, width) for width in widths)
@@ -131,5 +131,5 @@ class TrackingPolicy(nn.Module):
             after += torch.lstm_cell(signal, states[2 * index : 2 * index + 2], *layer.all_weights[0])
             signal = functional.leaky_relu(after[-2], self.params.leaky_slope)
         correction = self.output(signal) * half
-        command = self.gains.command(error, (once, twice), u_previous) + correction - before
-        return command, (error, once, correction, *after)
+        moves = torch.cat([error, once, twice], dim=-1) @ self.law.mT
+        return u_previous + moves + correction - before, (error, once, correction, *after)

@@ -33,9 +33,7 @@ class PolicyStep(nn.Module):
     deviation is taken before anything is rounded.
     """
 
-    proportional: Tensor
-    integral: Tensor
-    derivative: Tensor
+    law: Tensor
     unit: Tensor
     centre: Tensor
     reach: Tensor
@@ -50,7 +48,7 @@ class PolicyStep(nn.Module):
         super().__init__()
         self.cells = list(policy.params.hidden_cells)
         self.slope = policy.params.leaky_slope
-        doubles = vars(policy.gains) | {"steady_y": steady_y, "steady_u": steady_u}
+        doubles = {"law": policy.gains.law, "steady_y": steady_y, "steady_u": steady_u}
         doubles |= {name: getattr(policy, name) for name in ("unit", "centre", "reach", "low", "high")}
         for name, value in doubles.items():
             self.register_buffer(name, value.detach().double())
@@ -82,8 +80,7 @@ class PolicyStep(nn.Module):
             after += [hidden, cell]
             signal = functional.leaky_relu(hidden, self.slope)
         correction = functional.linear(signal, self.output_weight, self.output_bias).double() * half
-        law = (error - once) @ self.proportional.T + error @ self.integral.T + (error - 2 * once + twice) @ self.derivative.T
-        command = last + law + correction - before
+        command = last + torch.cat([error, once, twice], dim=-1) @ self.law.T + correction - before
         u = torch.minimum(torch.maximum(command, self.low), self.high) + self.steady_u
         return (u, error, once, correction, *after)
 

@@ -42,6 +42,7 @@ class ArmaxModel:
     def __post_init__(self) -> None:
         _, self.n_outputs, self.n_inputs = self.entry.shape
         self.n_states = self.window.shape[2]
+        self.growing = bool(self.spread[..., 1].any())
 
     def __len__(self) -> int:
         return len(self.window)
@@ -58,7 +59,8 @@ class ArmaxModel:
         """The next state, shape (K, n_x), of one model or of one an episode; of the noise (K, n_x) the first n_y columns count."""
         n_y, n_u = self.n_outputs, self.n_inputs
         y = self.constant + (self.window @ x[..., None] + self.entry @ u[..., None])[..., 0]
-        e = (self.spread[..., 0] ** 2 + (self.spread[..., 1] * y) ** 2).sqrt() * noise[:, :n_y]
+        size = (self.spread[..., 0] ** 2 + (self.spread[..., 1] * y) ** 2).sqrt() if self.growing else self.spread[..., 0]
+        e = size * noise[:, :n_y]
         widths = [n_y * self.lags, n_u * (self.taps - 1), n_y * self.lags]
         outputs, inputs, innovations = x.split(widths, dim=-1)
         moved = torch.cat([u, inputs], dim=-1)[:, : widths[1]]

@@ -101,7 +101,9 @@ def targets(
 def draw_scenarios(
     models: ArmaxModel, operation: Operation, params: OperationParams, n_steps: int, generator: torch.Generator, quiet: bool = False
 ) -> Scenarios:
-    """An episode for each model: at rest, two set point steps and a load step; `quiet` without noise.
+    """An episode for each model: at rest, two set point steps and a load step.
+
+    A `quiet` one has no noise and a single step at its start, and ends long after its load step: what is left then is offset.
 
     Raises:
         InputError: if hardly any model can be held at a set point of the range.
@@ -119,6 +121,8 @@ def draw_scenarios(
         raise InputError("the model has no steady state at the set points of the record")
     time = torch.arange(n_steps)[:, None]
     steps = (0.15 * share(n_models) * (share(n_models) < 0.5), 0.4 + 0.3 * share(n_models), 0.15 + 0.6 * share(n_models))
+    if quiet:
+        steps = tuple(torch.full((n_models,), place) for place in (0.0, 1.0, 0.25))
     to_second, to_third, to_load = ((n_steps * part).long() for part in steps)
     set_point = torch.where((time >= to_second)[..., None], second, first)
     set_point = torch.where((time >= to_third)[..., None], third, set_point)

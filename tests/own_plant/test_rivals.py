@@ -1,0 +1,111 @@
+"""What a practitioner would take: the PID of a record is found, re-tuned, and beside it predictive control without offset."""
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.learning.tracking_policy import Gains, VelocityPID
+from helpers.own_plant.gate import POLICY, RECORD, TUNED, judge
+from helpers.own_plant.identify import Equation, Margins, Structure, apart, assemble
+from helpers.own_plant.operation import Operation, draw_scenarios
+from helpers.own_plant.rivals import PredictiveControl, simc, step_response, tuned_pid, tuned_predictive
+from helpers.own_plant.settings import load_own_plant
+from helpers.plant.tracking import Bounds, track
+
+HEATER = Equation(Structure(1, (2,)), np.array([0.92, 0.064, 0.0, -0.8]), np.array([0.05, 0.0]))  # gain 0.8, time 12, dead time 2
+
+
+def models(n_models=16, gain=0.2):
+    factors = np.linspace(1 - gain, 1 + gain, n_models)
+    return assemble([[apart(HEATER, Margins(np.array([factor]), 1.0, (0,)))] for factor in factors], (np.ones(1), np.ones(1)))
+
+
+@pytest.fixture
+def operation():
+    bounds = Bounds(torch.tensor([-40.0]), torch.tensor([60.0]), torch.full((1,), torch.inf))
+    one = torch.ones(1)
+    return Operation((0,), -10 * one, 10 * one, 10 * one, bounds)
+
+
+@pytest.fixture(scope="module")
+def params(root):
+    quick = {"generations": 4, "penalties": (1.0, 10.0, 100.0), "observer": (0.8,)}
+    given = load_own_plant(root)
+    return given.model_copy(update={"rivals": given.rivals.model_copy(update=quick)})
+
+
+def scenarios(operation, params, quiet=False, **changes):
+    drawn = models(**changes).to(torch.float32)
+    return draw_scenarios(drawn, operation, params.operation, 150, torch.Generator().manual_seed(0), quiet)
+
+
+def pid(proportional, integral):
+    return Gains(torch.tensor([[proportional]]), torch.tensor([[integral]]), torch.zeros(1, 1))
+
+
+def price(error, movement):
+    return error.mean(-1)
+
+
+def test_scenarios_start_at_rest_and_can_be_held(operation, params):
+    drawn = scenarios(operation, params, quiet=True)
+    still = track(VelocityPID(pid(0.0, 0.0)), drawn, operation.bounds)
+    assert still.y[20].numpy() == pytest.approx(still.y[0].numpy(), abs=1e-4)
+    assert (still.y[-1] - still.y[0]).abs().max() > 1  # the load
+    assert (drawn.set_point.abs() <= 10).all()
+    assert (drawn.load.abs() <= params.operation.load * 100).all()
+    assert drawn.load[0].eq(0).all()
+    assert drawn.load[-1].ne(0).any()
+
+
+def test_the_simc_rule_is_that_of_the_literature():
+    response = step_response(models(1, 0.0), 300)[0, :, 0]
+    gain, integral = simc(response)
+    time, dead = -1 / np.log(0.92), 2.0
+    assert gain == pytest.approx(time / (0.8 * 2 * dead), rel=0.15)
+    assert integral == pytest.approx(gain / min(time, 8 * dead), rel=0.1)
+    ramp = np.concatenate([np.zeros(3), 0.05 * np.arange(1, 200)])
+    gain, integral = simc(ramp)
+    assert gain == pytest.approx(1 / (0.05 * 2 * 2), rel=0.3)
+    assert integral == pytest.approx(gain / 16, rel=0.3)
+
+
+def test_the_re_tuned_pid_is_better_than_the_record_s_on_all_models(operation, params):
+    drawn, record = scenarios(operation, params), pid(0.5, 0.05)
+    tuned = tuned_pid(models(1, 0.0), drawn, record, operation, price, params.rivals, seed=0)
+    errors = [operation.error(track(VelocityPID(gains), drawn, operation.bounds)).mean() for gains in (record, tuned)]
+    assert errors[1] < 0.8 * errors[0]
+    assert (tuned.integral > 0).all()
+
+
+def test_predictive_control_leaves_no_offset_where_its_model_is_wrong(operation, params):
+    noisy, quiet = (scenarios(operation, params, still, gain=0.4) for still in (False, True))
+    control = tuned_predictive(models(1, 0.0), noisy, operation, price, params.rivals)
+    assert isinstance(control, PredictiveControl)
+    run = track(control, quiet, operation.bounds)
+    assert run.error[-1].abs().max() < 0.05
+    assert operation.error(track(control, noisy, operation.bounds)).mean() < 0.05 + 0.2
+
+
+def test_the_gate_releases_what_is_better_and_nothing_else(operation, params):
+    noisy, quiet = (scenarios(operation, params, still) for still in (False, True))
+    slow, good = VelocityPID(pid(0.5, 0.05)), VelocityPID(pid(1.5, 0.12))
+
+    def verdict(policy, allowed, **others):
+        return judge({RECORD: slow, **others, POLICY: policy}, noisy, quiet, operation, allowed, params.gate)
+
+    better = verdict(good, 10.0)
+    assert better.released
+    assert better.keep == POLICY
+    assert better.words.startswith("verdict: release the policy: on models held out its mean |e| is ")
+    assert len(better.episodes) == 32
+    assert not verdict(good, 0.5).released
+    assert "times as much" in verdict(good, 0.5).words
+    worse = verdict(VelocityPID(pid(0.2, 0.02)), 10.0)
+    assert worse.words.startswith("verdict: keep the PID: the policy is not released: it is better in only ")
+    drifting = verdict(VelocityPID(pid(3.0, 0.0)), 10.0)
+    assert "it leaves an offset of" in drifting.words
+    as_good = verdict(good, 10.0, **{TUNED: good})
+    assert as_good.released
+    assert as_good.keep == TUNED
+    assert f"but {TUNED} is as good and simpler" in as_good.words

@@ -69,7 +69,8 @@ class Loop:
     """
 
     def __init__(self, channels, gains, noise=0.02, seed=0):
-        self.channels, self.gains, self.noise, self.rng = channels, np.asarray(gains, dtype=float), noise, np.random.default_rng(seed)
+        self.channels, self.gains, self.noise = channels, np.asarray(gains, dtype=float), noise
+        self.rng = np.random.default_rng(seed)
 
     def record(self, n_samples=2400, hold=60, size=5.0):
         n_y, n_u = len(self.channels), len(self.channels[0])

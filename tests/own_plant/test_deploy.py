@@ -1,84 +1,97 @@
-"""A policy as a file: it does what torch does over whole episodes, in engineering units, within the bounds, quickly."""
+"""A policy as a file does what torch does over whole episodes, within the bounds, and so does its C source."""
 
+import ctypes
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import onnx
 import pytest
 import torch
 
-from helpers.learning.policy import LSTMPolicy, PolicyController
-from helpers.own_plant.deploy import DeployedPolicy, disagreement, export
-from helpers.own_plant.description import load_description
-from helpers.plant.rollout import stream
+from helpers.learning.tracking_policy import Gains, TrackingPolicy
+from helpers.own_plant.deploy import DeployedPolicy, disagreement, export, export_c, memory_names
+from helpers.plant.tracking import Bounds
 from helpers.settings.leaf import InputError
 from helpers.settings.paper import load
-from tests.own_plant.plants import MadeUpPlant
 
 
-@pytest.fixture(params=[(1, 1), (2, 2), (3, 2)], ids=str)
+@pytest.fixture(params=[(1, 1), (3, 2)], ids=str)
 def deployed(request, tmp_path, root):
-    """A policy with random weights, its file, its task and the steady state."""
+    """A policy with random weights, its files, and the steady state."""
     n_y, n_u = request.param
-    description = load_description(MadeUpPlant(n_y, n_u, n_cycles=1).write(tmp_path))
-    task = description.task(torch.zeros(n_y), torch.zeros(n_y), torch.float64)
-    params = load(root, 1).learning.policy.model_copy(update={"error_unit": (0.3,) * n_y, "hidden_cells": (7, 5)})
-    policy = LSTMPolicy.initial(params, task, stream(0, "deployed"))
-    with torch.no_grad():
-        for name, parameter in policy.named_parameters():
-            parameter.mul_(3 if "weight" in name else 1)  # the biases keep the mean between the bounds
-    steady = description.steady("controlled"), description.steady("manipulated")
-    path = export(policy, task, *steady, tmp_path / "policy.onnx", {"title": description.title})
-    return policy, DeployedPolicy(path), task, steady
+    torch.manual_seed(0)
+    params = load(root, 1).learning.policy.model_copy(update={"hidden_cells": (7, 5)})
+    gains = Gains(*(torch.rand(n_u, n_y) for _ in range(3)))
+    bounds = Bounds(-3 * torch.ones(n_u), 4 * torch.ones(n_u), torch.full((n_u,), torch.inf))
+    policy = TrackingPolicy(params, gains, 2 * torch.ones(n_y), torch.zeros(n_y), torch.ones(n_y), bounds)
+    torch.nn.init.normal_(policy.output.weight)
+    steady = torch.arange(50, 50 + n_y).double(), torch.arange(20, 20 + n_u).double()
+    paths = [export(policy, *steady, tmp_path / f"{static}.onnx", {"title": "made up"}, static) for static in (False, True)]
+    return policy, *paths, steady
 
 
-def recorded(task, n_steps=50, n_episodes=20):
-    """Observations and inputs that go everywhere, beyond the bounds of what a plant does."""
-    draws = torch.randn(n_steps + 1, n_episodes, len(task.set_point), generator=stream(0, "y"), dtype=torch.float64)
-    share = torch.rand(n_steps, n_episodes, len(task.input_low), generator=stream(0, "u"), dtype=torch.float64)
-    return task.set_point + 2 * draws, task.input_low + (task.input_high - task.input_low) * share
+def episodes(policy, n_episodes=20):
+    n_y = len(policy.unit)
+    draws = torch.randn(2, 40, n_episodes, n_y, generator=torch.Generator().manual_seed(1))
+    return 3 * draws[0], draws[1]
 
 
 def test_file_and_torch_agree_over_whole_episodes(deployed):
-    policy, file, task, steady = deployed
-    assert disagreement(policy, file, task, *recorded(task), *steady) < 1e-5
-
-
-def test_another_policy_does_not_agree(deployed):
-    policy, file, task, steady = deployed
+    policy, batched, static, steady = deployed
+    assert disagreement(policy, DeployedPolicy(batched), *episodes(policy), *steady) < 1e-6
+    assert disagreement(policy, DeployedPolicy(static), *episodes(policy, 1), *steady) < 1e-6
     with torch.no_grad():
-        policy.layers[1].weight_hh_l0.mul_(1.01)
-    assert disagreement(policy, file, task, *recorded(task), *steady) > 1e-5
+        policy.layers[1].weight_hh_l0.mul_(1.05)
+    assert disagreement(policy, DeployedPolicy(batched), *episodes(policy), *steady) > 1e-5
 
 
-def test_in_closed_loop_the_file_is_the_policy_in_engineering_units(deployed):
-    policy, file, task, (steady_y, steady_u) = deployed
-    controller = PolicyController(policy, task, exploring=False)
-    memory = controller.start(1, 30, torch.Generator())
-    file.reset()
-    y, applied = torch.zeros(1, len(steady_y), dtype=torch.float64), steady_u[None].numpy()
-    for _ in range(30):
-        command, memory = controller.act(y, memory)
-        expected = command.clamp(task.input_low, task.input_high)
-        applied = file.step((y + steady_y).numpy(), (task.set_point + steady_y)[None].numpy(), applied)
-        assert applied == pytest.approx((expected + steady_u).numpy(), abs=1e-4)
-        y = 0.9 * y + 0.1 * expected.mean()
+def test_the_static_file_has_fixed_shapes_and_the_batch_comes_first(deployed):
+    policy, batched, static, _ = deployed
+    for path, first in ((static, 1), (batched, "K")):
+        file = DeployedPolicy(path)
+        assert {shape[0] for shape in file.shapes} == {first}
+        assert all(isinstance(size, int) for shape in file.shapes for size in shape[1:])
+    assert [entry.name for entry in onnx.load(static).graph.output] == ["u", *(f"{name}_next" for name in memory_names(policy))]
 
 
 def test_the_inputs_stay_within_the_bounds(deployed):
-    _, file, task, (steady_y, steady_u) = deployed
+    policy, batched, _, (steady_y, steady_u) = deployed
+    file = DeployedPolicy(batched)
     for size in (-1e3, 1e3):
         file.reset()
         u = file.step((steady_y + size)[None].numpy(), steady_y[None].numpy(), steady_u[None].numpy())
-        assert (u >= (task.input_low + steady_u).numpy() - 1e-9).all()
-        assert (u <= (task.input_high + steady_u).numpy() + 1e-9).all()
+        assert (u >= (policy.low + steady_u).numpy() - 1e-9).all()
+        assert (u <= (policy.high + steady_u).numpy() + 1e-9).all()
 
 
-def test_the_file_tells_about_itself_and_another_file_is_refused(deployed, tmp_path):
-    assert deployed[1].notes == {"title": "made up"}
-    (tmp_path / "wrong.onnx").write_bytes(b"not a policy")
-    with pytest.raises(InputError, match=r"wrong\.onnx: not a policy that can be run"):
-        DeployedPolicy(tmp_path / "wrong.onnx")
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+def test_the_c_source_compiles_and_agrees_with_the_file(deployed, tmp_path):
+    _, _, static, (steady_y, steady_u) = deployed
+    source = export_c(static, tmp_path / "policy.c")
+    library = tmp_path / "policy.so"
+    subprocess.run(["cc", "-O1", "-shared", "-fPIC", source, "-o", library, "-lm"], check=True)
+    function, file = ctypes.CDLL(str(library)).policy, DeployedPolicy(static)
+    memory = [np.zeros_like(entry) for entry in file.memory]
+    y, aim, u = steady_y[None].numpy(), steady_y[None].numpy(), steady_u[None].numpy()
+    rng, address = np.random.default_rng(0), ctypes.c_void_p
+    for _ in range(30):
+        y = y + rng.normal(size=y.shape)
+        after, applied = [np.empty_like(entry) for entry in memory], np.empty_like(u)
+        function(*(address(array.ctypes.data) for array in (y, aim, u, *memory, applied, *after)))
+        assert applied == pytest.approx(file.step(y, aim, u), abs=1e-5)
+        memory, u = after, applied
 
 
-def test_a_file_that_gives_no_number_does_not_agree(deployed):
-    policy, file, task, steady = deployed
-    y, u = recorded(task)
-    y[3] = torch.nan
-    assert not disagreement(policy, file, task, y, u, *steady) <= 1e-5
+def test_what_is_no_policy_is_refused_in_one_sentence(deployed, tmp_path):
+    (tmp_path / "text.onnx").write_text("no policy", encoding="utf-8")
+    with pytest.raises(InputError, match=r"text\.onnx: not a policy that can be run"):
+        DeployedPolicy(tmp_path / "text.onnx")
+    _, batched, _, _ = deployed
+    assert DeployedPolicy(batched).notes == {"title": "made up"}
+    file = onnx.load(batched)
+    onnx.helper.set_model_props(file, {"title": "no json", "other": json.dumps(1)})
+    onnx.save(file, tmp_path / "notes.onnx")
+    with pytest.raises(InputError, match=r"notes\.onnx: the note 'title' of the policy cannot be read"):
+        DeployedPolicy(tmp_path / "notes.onnx")

@@ -5,7 +5,18 @@ import pytest
 import torch
 
 from helpers.own_plant.episodes import Stretch
-from helpers.own_plant.identify import Equation, Margins, Record, Structure, apart, assemble, hold_out, identify, thin_out, validate_model
+from helpers.own_plant.identify import (
+    Equation,
+    Margins,
+    Record,
+    Structure,
+    apart,
+    assemble,
+    hold_out,
+    identify,
+    thin_out,
+    validate_model,
+)
 from helpers.own_plant.settings import load_own_plant
 from helpers.settings.leaf import InputError
 from tests.own_plant.plants import Loop
@@ -113,8 +124,8 @@ def test_the_model_of_the_equations_is_their_recursion():
         kick = torch.zeros(1, model.n_states, dtype=torch.float64)
         kick[0, :2] = torch.tensor(noise[t])
         x = model.step(x, torch.tensor(u[t])[None], kick)
-        y0 = 0.5 * y[t, 0] + 0.2 * past(y, t - 1, 0) + past(u, t - 1, 0) + 2 * past(u, t - 2, 0) + 3 * u[t, 1] + 4 * past(u, t - 1, 1)
-        y0 += 0.1 + 0.3 * e[t, 0] + 0.4 * past(e, t - 1, 0)
+        y0 = 0.5 * y[t, 0] + 0.2 * past(y, t - 1, 0) + past(u, t - 1, 0) + 2 * past(u, t - 2, 0)
+        y0 += 3 * u[t, 1] + 4 * past(u, t - 1, 1) + 0.1 + 0.3 * e[t, 0] + 0.4 * past(e, t - 1, 0)
         y1 = 0.7 * y[t, 1] + 5 * u[t, 0] + 6 * past(u, t - 2, 1) + 0.2 - 0.6 * e[t, 1]
         e[t + 1] = 0.5 * noise[t, 0], 0.5 * abs(y1) * noise[t, 1]
         y[t + 1] = y0 + e[t + 1, 0], y1 + e[t + 1, 1]

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from helpers.own_plant.description import load_description
-from helpers.own_plant.model import LinearModel, load_plant
+from helpers.own_plant.model import load_plant
 from helpers.plant.rollout import rollout
 from helpers.settings.leaf import InputError
 from tests.own_plant.plants import MadeUpPlant
@@ -51,15 +51,6 @@ def own(monkeypatch):
     module.Own = Own
     monkeypatch.setitem(sys.modules, "own_module", module)
     return module
-
-
-def test_a_step_of_the_linear_model_is_its_equation():
-    matrices = [[0.5, 0.1], [0.0, 1.0]], [[1.0], [2.0]]
-    model = LinearModel(*(torch.tensor(values) for values in (*matrices, [0.1, 0.0], [3.0, 0.0], [4.0, 0.0], [0.3], [0.4])))
-    x, u, noise = torch.tensor([[1.0, 2.0]]), torch.tensor([[10.0]]), torch.tensor([[1.0, 1.0]])
-    assert model.step(x, u, noise)[0].tolist() == pytest.approx([0.5 + 0.2 + 10 + 0.1 + 5.0, 22.0])
-    assert model.observe(x, torch.ones(1, 1)).tolist() == [[pytest.approx(1.5)]]
-    assert model.to(torch.float64).step(x.double(), u.double(), noise.double()).dtype == torch.float64
 
 
 def test_a_class_of_one_s_own_is_found_by_its_import_path(own, description):

@@ -18,6 +18,7 @@ from helpers.learning.tracking_policy import TrackingPolicy
 from helpers.plant.process import Process
 from helpers.plant.tracking import Bounds, Scenarios, Tracked, track
 
+PATIENCE = 5  # steps after each other without a finite gradient
 Draw = Callable[[], Scenarios]
 Watch = Callable[["GradientRecord"], object]  # called with the record of each step
 Measure = Callable[[Scenarios, Tracked], tuple[Tensor, Tensor]]  # of each episode: cost, and movement as a share of what is allowed
@@ -72,10 +73,10 @@ def model_gradient(
         draw: gives the episodes of a step. measure: what they cost.
 
     Raises:
-        TrainingError: if cost or gradient are not finite.
+        TrainingError: if cost or gradient are not finite in several steps after each other; a single one is left out.
     """
     optimiser = torch.optim.Adam(policy.parameters(), lr=descent.rate_start)
-    price, records = descent.price, []
+    price, records, lost = descent.price, [], 0
     for step in range(descent.steps):
         for group in optimiser.param_groups:
             group["lr"] = annealed(descent.rate_start, descent.rate_end, step / max(1, descent.steps - 1))
@@ -84,8 +85,11 @@ def model_gradient(
         optimiser.zero_grad()
         (cost + price * (movement - descent.slack)).backward()
         length = nn.utils.clip_grad_norm_(policy.parameters(), descent.longest)
-        if not (torch.isfinite(cost) and torch.isfinite(length)):
+        lost = 0 if torch.isfinite(cost) and torch.isfinite(length) else lost + 1  # on some model the loop ran away
+        if lost > PATIENCE:
             raise TrainingError(f"gradient step {step + 1}: the cost of the policy or its gradient is not finite")
+        if lost:
+            continue
         optimiser.step()
         records.append(GradientRecord(step + 1, cost.item(), movement.item(), price, length.item()))
         price = max(0.0, price + descent.price_step * (movement.item() - descent.slack))

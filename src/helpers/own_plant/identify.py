@@ -342,7 +342,7 @@ def slowed(coefficients: Array, time: float) -> Array:
     """
     roots = np.roots(np.concatenate([[1.0], -coefficients])).astype(complex)
     moved = np.where((np.abs(roots.imag) > 1e-9) | (roots.real > 0), roots ** (1 / time), roots)
-    polynomial = -np.real(np.poly(moved))[1:]
+    polynomial = -np.real(np.atleast_1d(np.poly(moved)))[1:]
     return np.concatenate([polynomial, np.zeros(len(coefficients) - len(polynomial))])
 
 

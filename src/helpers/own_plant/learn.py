@@ -40,6 +40,7 @@ from helpers.settings.paper import FeatureParams, LearningParams, Params, ScaleP
 
 PIECE = 5  # episodes: how long the pieces of a long record are that the model is identified from
 VARIANT = "improved"  # of Algorithms 1 and 2
+HELD, FEWEST = 2.0, 0.1  # |e| in units of the range that a loop which is held never exceeds; least share of such models
 SLACK, BEYOND = 0.95, 10.0  # share of the allowed movement that is aimed at, and the price of more while the rivals are tuned
 
 
@@ -189,7 +190,8 @@ class Workshop:
     @property
     def n_steps(self) -> int:
         """Samples of an episode: long enough for two set point steps."""
-        return min(2 * self.plant.description.horizon, self.plant.params.operation.longest)
+        shortest, longest = self.plant.params.operation.samples
+        return min(max(2 * self.plant.description.horizon, shortest), longest)
 
     def draw(
         self, models: ArmaxModel, n_episodes: int, generator: torch.Generator, longer: int = 1, quiet: bool = False
@@ -206,7 +208,7 @@ class Workshop:
 
 
 def open_workshop(plant: OwnPlant, identified: Identified) -> Workshop:
-    """Draw the models, find the record's PID and the range of operation.
+    """Draw the models, find the record's PID and the range of operation; models on which that PID runs away are left out.
 
     Raises:
         InputError: if the record's controller is no PID and the description names none.
@@ -225,9 +227,20 @@ def open_workshop(plant: OwnPlant, identified: Identified) -> Workshop:
         replace(identified, members=part).ensemble(params.margins, n_models, plant.seed + k).to(dtype)
         for k, part in enumerate((members[:edge], members[edge:]))
     )
-    return Workshop(
-        plant, operation(clean, description, loops, dtype), record, explained, identified.nominal.to(dtype), training, held_out
-    )  # fmt: skip
+    whole = operation(clean, description, loops, dtype)
+    workshop = Workshop(plant, whole, record, explained, identified.nominal.to(dtype), training, held_out)
+    return replace(workshop, training=plausible(workshop, training), held_out=plausible(workshop, held_out))
+
+
+def plausible(workshop: Workshop, models: ArmaxModel) -> ArmaxModel:
+    """The models that the record's PID can hold, since the record shows that it holds the plant; all, if it can hold few."""
+    generator = workshop.plant.stream("plausible")
+    quiet = draw_scenarios(models, workshop.operation, workshop.plant.params.operation, 3 * workshop.n_steps, generator, quiet=True)
+    with torch.no_grad():
+        run = track(VelocityPID(workshop.record), quiet, workshop.operation.bounds)
+    late = (run.error[-workshop.n_steps :].abs() / workshop.operation.unit)[..., list(workshop.operation.loops)].amax((0, 2))
+    held = late < HELD
+    return models.members(held) if held.double().mean() > FEWEST else models
 
 
 def tune(workshop: Workshop) -> tuple[Gains, PredictiveControl]:

@@ -122,7 +122,7 @@ def draw_scenarios(
     time = torch.arange(n_steps)[:, None]
     steps = (0.15 * share(n_models) * (share(n_models) < 0.5), 0.4 + 0.3 * share(n_models), 0.15 + 0.6 * share(n_models))
     if quiet:
-        steps = tuple(torch.full((n_models,), place) for place in (0.0, 1.0, 0.25))
+        steps = (torch.zeros(n_models), torch.ones(n_models), torch.full((n_models,), 0.25))
     to_second, to_third, to_load = ((n_steps * part).long() for part in steps)
     set_point = torch.where((time >= to_second)[..., None], second, first)
     set_point = torch.where((time >= to_third)[..., None], third, set_point)

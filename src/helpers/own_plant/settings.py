@@ -49,7 +49,7 @@ class OperationParams(Record):
     still: Annotated[Share, Leaf("share")]
     reserve: Annotated[Share, Leaf("input range")]
     load: Annotated[Share, Leaf("input range")]
-    longest: Annotated[Count, Leaf("samples")]
+    samples: Annotated[tuple[Count, Count], Leaf("samples")]
 
 
 class RivalParams(Record):

@@ -33,8 +33,7 @@ class Verdict:
 
 def offsets(run: Tracked, operation: Operation) -> torch.Tensor:
     """|e| at the end of each undisturbed episode, of the worst loop, in ranges of the set points, (K,)."""
-    reach = torch.where(operation.high > operation.low, operation.high - operation.low, operation.unit)
-    error = (run.error.abs() / reach)[..., list(operation.loops)].amax(-1)
+    error = (run.error.abs() / operation.reach)[..., list(operation.loops)].amax(-1)
     return error[-1]
 
 

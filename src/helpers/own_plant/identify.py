@@ -8,6 +8,7 @@ greatest likelihood on records held out. The uncertainty is an ensemble: the sam
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -147,6 +148,7 @@ class Record:
         first = max(params.orders) + params.longest_dead_time + 1
         return cls([(piece.y[:, output] / scales[0][output], piece.u / scales[1]) for piece in pieces], first)
 
+    @lru_cache(maxsize=8)  # noqa: B019 - a record lives no longer than its identification
     def regression(self, structure: Structure) -> list[tuple[Array, Array]]:
         """Target (n,) and regressors (n, p) of each stretch: own past, inputs, and one."""
         found, first = [], self.first
@@ -257,7 +259,8 @@ def dead_times(record: Record, order: int, integrating: bool, start: tuple[int, 
     def cost(trial: tuple[int, ...]) -> float:
         if trial not in known:
             structure = Structure(order, trial, integrating)
-            known[trial] = float(sum((e**2).sum() for e in record.errors(structure, record.fit(structure, steps=2))))
+            fitted = record.fit(structure, record.starts(structure)[0], steps=1)
+            known[trial] = float(sum((e**2).sum() for e in record.errors(structure, fitted)))
         return known[trial]
 
     while True:

@@ -1,9 +1,11 @@
 """A few episodes of the plant itself: explore gently, identify again, improve through the new models, take over only if better."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from scipy.stats import ttest_rel
 from torch import Tensor
@@ -13,7 +15,9 @@ from helpers.own_plant.episodes import Stretch
 from helpers.own_plant.identify import Identified, identify
 from helpers.own_plant.learn import Workshop, learn_policy, open_workshop
 from helpers.plant.process import Process
-from helpers.plant.tracking import Scenarios, track
+from helpers.plant.tracking import Scenarios, Tracker, track
+
+FIGURES = ("mean |e|", "movement", "offset")
 
 
 @dataclass(frozen=True)
@@ -108,3 +112,55 @@ def improve_on_plant(workshop: Workshop, identified: Identified, policy: Trackin
     taken = p_value < params.level and moved[2] <= plant.params.policy.movement * moved[0]
     before, since = ((each / reference).mean().item() for each in (old, after))
     return Improvement(new if taken else policy, taken, params.explore + 2 * params.test, worse, before, since, p_value)
+
+
+def at_set_points(
+    workshop: Workshop,
+    process: Process,
+    candidates: Mapping[str, Tracker],
+    n_repeats: int,
+    factors: Sequence[float] = (0.0, 0.5, 1.0),
+) -> pd.DataFrame:
+    """Steps from rest to set points all over the range on whatever stands for the plant, a row a set point and controller.
+
+    Args:
+        factors: of the way from the lowest to the highest set point of each loop; every combination is one set point.
+
+    Returns:
+        Columns: the set point of each loop (engineering units), controller, mean |e| (in units of half the range), movement (as a share
+        of the input ranges, summed over an episode), and offset: the mean error over the last fifth, as a share of the range, of
+        the worst loop.
+    """
+    operation, dtype = workshop.operation, workshop.operation.unit.dtype
+    places = torch.cartesian_prod(*[torch.tensor(factors, dtype=dtype)] * len(operation.loops)).reshape(-1, len(operation.loops))
+    set_points = torch.zeros(len(places), len(operation.low), dtype=dtype)
+    loops = list(operation.loops)
+    set_points[:, loops] = operation.low[loops] + places * (operation.high - operation.low)[loops]
+    n_episodes, n_steps = len(set_points) * n_repeats, workshop.n_steps
+    generator = workshop.plant.stream("set points")
+    noise = [
+        torch.randn(n, n_episodes, size, generator=generator, dtype=dtype)
+        for n, size in ((n_steps, process.n_states), (n_steps + 1, process.n_outputs))
+    ]
+    zero = torch.zeros(n_episodes, process.n_inputs, dtype=dtype)
+    scenarios = Scenarios(
+        process, set_points.repeat_interleave(n_repeats, 0).expand(n_steps, -1, -1), zero.expand(n_steps, -1, -1),
+        torch.zeros(n_episodes, process.n_states, dtype=dtype), zero, *noise,
+    )  # fmt: skip
+    steady, rows = workshop.plant.description.steady("controlled", dtype), []
+    for name, tracker in candidates.items():
+        with torch.no_grad():
+            run = track(tracker, scenarios, operation.bounds)
+        error, moved = (part.reshape(-1, n_repeats).mean(1) for part in (operation.error(run), n_steps * operation.movement(run)))
+        late = (
+            (run.error[-n_steps // 5 :] / operation.reach)[..., loops]
+            .mean(0)
+            .reshape(-1, n_repeats, len(loops))
+            .mean(1)
+            .abs()
+            .amax(-1)
+        )
+        for point, *values in zip(set_points + steady, error, moved, late, strict=True):
+            aims = {workshop.plant.controlled[index]: point[index].item() for index in loops}
+            rows.append({**aims, "controller": name, **dict(zip(FIGURES, (float(value) for value in values), strict=True))})
+    return pd.DataFrame(rows)

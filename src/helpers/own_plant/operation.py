@@ -36,6 +36,11 @@ class Operation:
     bounds: Bounds
 
     @property
+    def reach(self) -> Tensor:
+        """From the least to the greatest set point, (n_y,); the unit where they do not differ."""
+        return torch.where(self.high > self.low, self.high - self.low, self.unit)
+
+    @property
     def centre(self) -> Tensor:
         """Middle of the set points, (n_y,)."""
         return (self.low + self.high) / 2

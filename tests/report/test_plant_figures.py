@@ -1,16 +1,21 @@
 """The figures of one's own plant show what is in the tables, with units; the guard's trial runs as planned."""
 
+import numpy as np
+import pandas as pd
 import pytest
 import torch
 from matplotlib.figure import Figure
 
-from helpers.own_plant import learn
+from helpers.learning.model_gradient import GradientRecord
+from helpers.learning.tracking_policy import Gains, VelocityPID
+from helpers.own_plant import gate, learn
 from helpers.own_plant.commissioning import Trial, commission
 from helpers.own_plant.guard import Guard
-from helpers.own_plant.model import LinearModel
+from helpers.own_plant.identify import Equation, Structure, Validation, assemble
+from helpers.own_plant.operation import Operation
+from helpers.plant.tracking import Bounds
 from helpers.report import plant_figures
-from helpers.report.figures import control_figure, drawn_summary
-from helpers.runs.stages import response_table
+from helpers.report.figures import drawn_summary
 from tests.own_plant.plants import MadeUpPlant
 
 
@@ -22,49 +27,70 @@ def plant(tmp_path_factory, root):
     return learn.open_plant(made_up.write(tmp_path_factory.mktemp("plant"), table), root, "smoke", 0)
 
 
+@pytest.fixture
+def model():
+    """Three outputs of first order, each driven by both inputs."""
+    equations = [Equation(Structure(1, (0, 0)), np.array([0.9, 0.1, 0.05, 0.0, -0.5]), np.array([0.01, 0.0])) for _ in range(3)]
+    return assemble([equations], (np.ones(3), np.ones(2)))
+
+
 def test_the_quality_figure_has_a_panel_a_variable_with_its_unit(plant):
     figure = plant_figures.quality_figure(plant.clean, plant.description)
-    assert [axis.get_label() for axis in figure.axes] == ["Y0.PV", "Y1.PV", "Y2.PV", "U0.OP", "U1.OP"]
+    assert [axis.get_label() for axis in figure.axes] == ["y0", "y1", "y2", "u0", "u1"]
     assert {axis.get_ylabel() for axis in figure.axes} == {"%"}
     shown = drawn_summary(figure).set_index(["panel", "artist"])
-    assert shown.loc[("Y1.PV", "Y1.PV"), "mean"] == pytest.approx(plant.clean.table["Y1.PV"].mean())
-    assert shown.loc[("Y1.PV", "not in automatic"), ["from", "to"]].to_numpy().ravel().tolist() == [100, 109]
+    assert shown.loc[("y1", "Y1.PV"), "mean"] == pytest.approx(plant.clean.table["Y1.PV"].mean())
+    assert shown.loc[("y1", "not in automatic"), ["from", "to"]].to_numpy().ravel().tolist() == [100, 109]
     first = plant_figures.quality_figure(plant.clean, plant.description, first=10, n_samples=50)
     assert drawn_summary(first)["from"].min() == 10
 
 
-def test_the_response_figure_has_a_panel_a_variable_for_any_number_of_them(plant):
-    recorded = plant.demonstrations.trajectories
-    response = response_table(recorded, recorded, plant.controlled, plant.manipulated)
-    figure = plant_figures.response_figure(response, plant.description)
+def test_an_episode_is_shown_in_engineering_units_under_every_controller(plant, model):
+    none = torch.zeros(3)
+    bounds = Bounds(torch.tensor([-3.0, -3.0]), torch.tensor([3.0, 3.0]), torch.full((2,), torch.inf))
+    operation = Operation((0,), none - 1, none + 1, none + 1, bounds)
+    record = Gains(*(torch.eye(2, 3) for _ in range(3)))
+    workshop = learn.Workshop(plant, operation, record, 1.0, *[model.to(torch.float32)] * 3)
+    figure = plant_figures.loops_figure(
+        workshop, {gate.RECORD: VelocityPID(record), gate.POLICY: VelocityPID(record)}, plant.description
+    )
     shown = drawn_summary(figure).set_index(["panel", "artist"])
-    assert [axis.get_label() for axis in figure.axes if axis.get_visible()] == ["y0", "y1", "y2", "u0", "u1"]
-    variable = plant.description.controlled[1]
-    assert shown.loc[("y1", "record"), "last"] == pytest.approx(variable.steady_state + recorded.y[-1, :, 1].mean().item())
-    assert shown.loc[("y1", "set point"), "last"] == variable.set_point
-    assert {axis.get_ylabel() for axis in figure.axes if axis.get_visible()} == {"%"}
-    assert {"record, input", "policy, input"} <= set(shown.loc["u0"].index)
+    assert [axis.get_label() for axis in figure.axes] == [*plant.controlled, *plant.manipulated]
+    assert "set point" in shown.loc["y0"].index
+    assert "set point" not in shown.loc["y1"].index
+    steady = plant.description.controlled[1].steady_state
+    assert shown.loc[("y1", gate.POLICY), "mean"] == pytest.approx(shown.loc[("y1", gate.RECORD), "mean"])
+    assert abs(shown.loc[("y1", gate.POLICY), "mean"] - steady) < 10
+
+
+def test_the_gate_s_figure_shows_the_rivals_and_the_curves_their_levels():
+    rng = np.random.default_rng(0)
+    parts = [
+        pd.DataFrame({"mean |e|": rng.uniform(0.5, 1, 50), "movement": rng.uniform(0.5, 1, 50), "controller": name})
+        for name in gate.SIMPLEST
+    ]
+    figure = plant_figures.gate_figure(gate.Verdict(pd.DataFrame(), pd.concat(parts), True, gate.POLICY, ""))
+    assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == [gate.TUNED, gate.PREDICTIVE, gate.POLICY]
+    assert figure.axes[1].get_xlabel() == "movement, share of the record's PID's"
+    curves = plant_figures.progress_figure([GradientRecord(n, 1 / n, 0.9, 0.1, 0.2) for n in range(1, 6)])
+    assert curves.axes[0].lines[0].get_ydata()[-1] == pytest.approx(0.2)
+    assert {axis.get_xlabel() for axis in curves.axes} == {"gradient step"}
 
 
 def test_the_validation_figure_shows_a_window_and_the_residuals(plant):
-    _, validation = learn.identify_plant(plant)
-    figure = plant_figures.validation_figure(validation, plant.description)
-    shown = drawn_summary(figure).set_index(["panel", "artist"])
-    assert shown.loc[("y2 simulated", "measured"), "mean"] == pytest.approx(validation.measured[0, :, 2].mean())
-    assert shown.loc[("y2 simulated", "simulated from the inputs"), "last"] == pytest.approx(validation.simulated[0, -1, 2])
+    rng = np.random.default_rng(0)
+    measured, simulated = rng.normal(size=(2, 4, 12, 3))
+    validation = Validation(np.full(3, 0.9), measured, simulated, tuple(rng.normal(size=(3, 200))), np.full(3, 0.5), ())
+    shown = drawn_summary(plant_figures.validation_figure(validation, plant.description)).set_index(["panel", "artist"])
+    assert shown.loc[("y2 simulated", "measured"), "mean"] == pytest.approx(measured[0, :, 2].mean())
+    assert shown.loc[("y2 simulated", "simulated from the inputs"), "last"] == pytest.approx(simulated[0, -1, 2])
     assert shown.loc[("y0 residuals", "autocorrelation"), "points"] == 20
 
 
-def test_responses_carry_the_units_of_the_plant(plant):
-    batch = learn.as_measured(plant.demonstrations.trajectories)
-    names = plant.controlled[:2], plant.manipulated
-    pair = type(batch)(*(getattr(batch, key)[..., :2] for key in ("x", "y", "u", "command")))
-    figure = control_figure(response_table(pair, pair, *names), *names, [1.0, 1.0])
-    labels = {axis.get_ylabel() for axis in plant_figures.with_units(figure, plant.description).axes}
-    assert all("deviation, %" in label for label in labels)
-
-
 class Asking:
+    def __init__(self):
+        self.notes = {}
+
     def reset(self):
         pass
 
@@ -72,12 +98,10 @@ class Asking:
         return u_previous + 0.1
 
 
-def test_a_trial_goes_from_manual_to_policy_to_hold_to_pid_and_back(plant):
-    size, none = 0.1 * torch.ones(3), torch.zeros(3)
-    model = LinearModel(0.9 * torch.eye(3), 0.1 * torch.ones(3, 2), none, size, none, size, none)
+def test_a_trial_goes_from_manual_to_policy_to_hold_to_pid_and_back(plant, model):
     guard = Guard(Asking(), plant.description)
     trial = Trial(n_samples=60, hand_over=5, step=8, fault=range(30, 40), faulty=1)
-    steps, seconds = commission(guard, model.to(torch.float64), trial, torch.Generator().manual_seed(0))
+    steps, seconds = commission(guard, model, trial, torch.Generator().manual_seed(0))
     modes = steps["mode"].ne(steps["mode"].shift()).cumsum()
     assert steps.groupby(modes)["mode"].first().tolist() == ["manual", "policy", "hold", "PID", "policy"]
     assert len(seconds) == len(steps) == 60

@@ -127,9 +127,9 @@ def at_set_points(
         factors: of the way from the lowest to the highest set point of each loop; every combination is one set point.
 
     Returns:
-        Columns: the set point of each loop (engineering units), controller, mean |e| (in units of half the range), movement (as a share
-        of the input ranges, summed over an episode), and offset: the mean error over the last fifth, as a share of the range, of
-        the worst loop.
+        Columns: the set point of each loop (engineering units), controller, mean |e| (in units of half the range), movement (as a
+        share of the input ranges, summed over an episode), and offset: the mean error over the last fifth, as a share of the range,
+        of the worst loop.
     """
     operation, dtype = workshop.operation, workshop.operation.unit.dtype
     places = torch.cartesian_prod(*[torch.tensor(factors, dtype=dtype)] * len(operation.loops)).reshape(-1, len(operation.loops))

@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 
 from helpers.runs.identity import changes, inputs
-from helpers.settings.paper import load_trials
+from helpers.settings.paper import HEADLINE, load_trials
 
 ROOT = Path(workflow.basedir)
 SCALE = config.get("scale", "paper")
@@ -23,7 +23,6 @@ EVIDENCE = bool(int(config.get("evidence", 0)))
 MISSING = bool(int(config.get("missing", 0)))
 RESULTS = config.get("results", "results")
 REPORTS = config.get("reports", "reports/latest")
-HEADLINE = "improved"
 VARIANTS = [HEADLINE, "printed"]
 TRIALS = sorted(load_trials(ROOT / "params"))
 CASES = [1, 2, 3]
@@ -54,7 +53,7 @@ def made_from(notebook, record):
 
     def changed(wildcards):
         path = Path(record.format(**dict(wildcards.items())))
-        case, variant = getattr(wildcards, "case", None), getattr(wildcards, "variant", "improved")
+        case, variant = getattr(wildcards, "case", None), getattr(wildcards, "variant", HEADLINE)
         case = int(case) if case else 3 if "/case_3/" in record else None
         try:
             before = json.loads(path.read_text(encoding="utf-8"))
@@ -186,9 +185,9 @@ rule claims:
     input:
         made_from("08_claims", f"{CASE}/experiments/record.json"),
         demonstrations=f"{CASE}/demonstrations/record.json",
-        offline=f"{CASE}/offline_improved/record.json",
-        transfer=lambda wildcards: [f"{CASE}/transfer_improved/record.json"] if wildcards.case == "3" else [],
-        online=f"{CASE}/online_improved/record.json",
+        offline=f"{CASE}/offline_{HEADLINE}/record.json",
+        transfer=lambda wildcards: [f"{CASE}/transfer_{HEADLINE}/record.json"] if wildcards.case == "3" else [],
+        online=f"{CASE}/online_{HEADLINE}/record.json",
     output:
         f"{CASE}/experiments/record.json",
         f"{CASE}/online_budget/record.json",
@@ -203,9 +202,9 @@ rule limits:
     input:
         made_from("06_limits_and_alternatives", f"{CASE}/limits_safety/record.json"),
         demonstrations=f"{CASE}/demonstrations/record.json",
-        offline=f"{CASE}/offline_improved/record.json",
-        transfer=lambda wildcards: [f"{CASE}/transfer_improved/record.json"] if wildcards.case == "3" else [],
-        online=f"{CASE}/online_improved/record.json",
+        offline=f"{CASE}/offline_{HEADLINE}/record.json",
+        transfer=lambda wildcards: [f"{CASE}/transfer_{HEADLINE}/record.json"] if wildcards.case == "3" else [],
+        online=f"{CASE}/online_{HEADLINE}/record.json",
     output:
         [f"{CASE}/limits_{part}/record.json" for part in ("attainable", "budget", "quality", "robustness", "safety")],
     log:
@@ -233,9 +232,9 @@ def of_seed(seed):
     folder = f"{RESULTS}/{SCALE}/seed_{seed}"
     stages = [f"{folder}/case_{case}/demonstrations/record.json" for case in CASES]
     stages += [f"{folder}/case_{case}/offline_{variant}/record.json" for case in (1, 2) for variant in VARIANTS]
-    stages += [f"{folder}/case_3/offline_improved/record.json"]
+    stages += [f"{folder}/case_3/offline_{HEADLINE}/record.json"]
     stages += [f"{folder}/case_3/transfer_{variant}/record.json" for variant in VARIANTS]
-    stages += [f"{folder}/case_{case}/online_improved/record.json" for case in CASES]
+    stages += [f"{folder}/case_{case}/online_{HEADLINE}/record.json" for case in CASES]
     return stages
 
 

@@ -10,7 +10,7 @@ from helpers.own_plant.guard import Guard
 from helpers.own_plant.model import LinearModel
 from helpers.report import plant_figures
 from helpers.report.figures import control_figure, drawn_summary
-from helpers.runs.stages import response_table
+from helpers.runs.study import response_table
 from tests.own_plant.plants import MadeUpPlant
 
 

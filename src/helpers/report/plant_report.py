@@ -39,7 +39,7 @@ from helpers.report.plant_figures import quality_figure, response_figure, valida
 from helpers.runs.request import check_place
 from helpers.runs.scratch import beside, sweep
 from helpers.runs.sources import PROJECT
-from helpers.runs.stages import response_table
+from helpers.runs.study import response_table
 from helpers.settings.leaf import InputError
 from helpers.settings.paper import load
 

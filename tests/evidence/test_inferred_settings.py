@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.evidence import inferred_settings
-from helpers.runs.session import open_identification
+from helpers.runs.opening import open_identification
 
 
 @pytest.fixture

@@ -329,7 +329,8 @@ def changes_of_tables(draw):
 @some(0.25)
 @given(change=changes_of_tables(), dtype=st.sampled_from([torch.float32, torch.float64]))
 def test_mutated_tables_of_demonstrations(tmp_path, recorded, change, dtype):
-    stage = save_stage(tmp_path / "stage", {}, texts={"demonstrations.csv": change(recorded)})
+    stage = save_stage(tmp_path / "stage", {}, {"demonstrations.csv": recorded})
+    stage.path("demonstrations.csv").write_text(change(recorded), encoding="utf-8")
     path = stage.path("demonstrations.csv")
     found = outcome(lambda: trajectories_from_table(stage.table("demonstrations.csv"), *NAMES, dtype, path), f"{path}: ")
     if found is not None:

@@ -6,8 +6,8 @@ from typing import get_args
 import pytest
 import torch
 
+from helpers.runs.opening import parameters_hash
 from helpers.runs.request import SessionError, check_parameters
-from helpers.runs.session import parameters_hash
 from helpers.settings.leaf import read_yaml
 from helpers.settings.paper import TrialParams, load, load_trials
 from tests.runs.test_study import session

@@ -1,7 +1,7 @@
 """The extra runs behind the claims: each verb takes what `prepare` loaded and returns figures of merit by the name of a run.
 
 Every run draws from the same random streams as the stages, so that runs of one seed can be compared with each other. A verb
-whose experiment is not planned for the session's case (params/experiments.yaml) returns nothing.
+whose experiment is not planned for the session's case or seed (params/experiments.yaml) returns nothing.
 """
 
 import math
@@ -48,8 +48,8 @@ class Prepared:
     curve: pd.DataFrame  # of the online learning that gave the improved policy: its history.csv
 
     def planned(self, experiment: ExperimentCases) -> bool:
-        """Whether an experiment is to be run in the session's case."""
-        return self.session.case in experiment.cases
+        """Whether an experiment is to be run in the session's case and for its seed."""
+        return experiment.planned(self.session.case, self.session.seed)
 
     @property
     def expert_features(self) -> Tensor:

@@ -16,7 +16,7 @@ from helpers.evidence.identification import Fit, Problem, Profile, fit, polish, 
 from helpers.evidence.readings import GAINS, MAIN, READINGS, TIME, Key, Reading, Values, Vector, simulate
 from helpers.learning.features import feature_names
 from helpers.plant.rollout import stream
-from helpers.runs.session import IdentificationSession
+from helpers.runs.opening import IdentificationSession
 from helpers.settings.paper import Params
 
 FINAL_TOLERANCE = 1.0e-7

@@ -185,9 +185,10 @@ def _claims(root: Path, params_root: Path, scale: str, seeds: Sequence[int]) -> 
 
 
 def _budget(found: Mapping[tuple[int, int], Stage]) -> pd.DataFrame:
-    """The objective after online learning by the episodes of an epoch, where that was run."""
+    """The objective after online learning by the episodes of an epoch, where that was run: not for all seeds."""
     columns = ("episodes_per_epoch", "objective")
-    frames = [stage.table("scores.csv", columns).assign(seed=seed, case=case) for (case, seed), stage in found.items()]
+    tables = ((stage.table("scores.csv", columns), *place) for place, stage in found.items())
+    frames = [table.assign(seed=seed, case=case) for table, case, seed in tables if len(table)]
     order = ["seed", "case", *columns]
     return pd.concat(frames, ignore_index=True)[order] if frames else pd.DataFrame(columns=order)
 

@@ -14,7 +14,7 @@ PYTEST = $(BIN)/python -m pytest --numprocesses $(CORES) --dist loadfile --no-lo
 SNAKEMAKE = $(BIN)/python -m snakemake --profile profiles/local --cores $(CORES)
 
 # Tests of numbers: what another processor may round otherwise.
-NUMERICAL := tests/plant tests/learning tests/evidence tests/own_plant tests/runs/test_stages.py
+NUMERICAL := tests/plant tests/learning tests/evidence tests/own_plant tests/runs/test_study.py
 
 .PHONY: help setup reports evidence smoke test portable lock lab bench torture cluster publish notebooks clean
 

@@ -14,7 +14,7 @@ from typing import Any
 from helpers.runs.artifacts import RECORD, load_stage
 from helpers.runs.sources import PROJECT
 
-PARTS = ("Snakefile", "params", "profiles", "src/helpers", "notebooks", "reports/template")
+PARTS = ("Snakefile", "rules", "params", "profiles", "src/helpers", "notebooks", "reports/template")
 HIDDEN_BUT_KEPT = (".changed",)
 
 Content = dict[str, tuple[Mapping[str, str], Mapping[str, str], str]]  # stage: hashes of its files, its upstream, its identity

@@ -10,7 +10,7 @@ from helpers.plant.controllers import Operator
 from helpers.plant.task import Trajectories
 from helpers.report.claims import load_claims
 from helpers.runs.session import open_session
-from helpers.runs.stages import score_table
+from helpers.runs.study import score_table
 from tests.evidence.test_experiments import short
 
 

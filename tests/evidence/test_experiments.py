@@ -8,9 +8,8 @@ import torch
 from ruamel.yaml import YAML
 
 from helpers.evidence import experiments
-from helpers.evidence.experiments import attempt, first_epoch, plan, prepare, response_figures, varied
+from helpers.evidence.experiments import attempt, first_epoch, plan, prepare, response_figures
 from helpers.plant.task import Trajectories
-from helpers.runs import stages
 from helpers.runs.session import open_session
 
 STREAMS = {"input_root": "", "output_root": ""}
@@ -93,7 +92,7 @@ def test_first_epoch():
 
 def test_a_varied_session_differs_in_what_was_asked_for_alone(prepared):
     session = prepared().session
-    other = varied(session, case={"set_point": (2.0, 5.0)}, offline={"epochs": 7}, process={"disturbance": (0.0, 0.0)})
+    other = session.varied(case={"set_point": (2.0, 5.0)}, offline={"epochs": 7}, process={"disturbance": (0.0, 0.0)})
     assert other.task.set_point.tolist() == [2.0, 5.0]
     assert other.params.case.offline.epochs == 7
     assert not other.process.disturbance_gain.any()
@@ -105,14 +104,14 @@ def test_a_varied_session_differs_in_what_was_asked_for_alone(prepared):
 def test_where_no_reward_can_be_found_the_policy_stays_as_it_was(prepared):
     """exp(-(beta e)^2) is nought in floating point for every error that an untrained policy makes."""
     session = prepared().session
-    start = stages.fresh_policy(session)
+    start = session.fresh_policy()
     policy, curve = attempt(session, start, [1e9, 1e9])
     assert policy is start
     assert curve.empty
     policy, curve = attempt(session, start, [1.0, 1.0])
     assert policy is not start
     assert len(curve) == 2
-    before, after = (torch.cat([entry.flatten() for entry in one.parameters()]) for one in (start, stages.fresh_policy(session)))
+    before, after = (torch.cat([entry.flatten() for entry in one.parameters()]) for one in (start, session.fresh_policy()))
     assert torch.equal(before, after)  # the start itself was not trained
 
 
@@ -123,7 +122,7 @@ def test_the_online_run_of_notebook_03_is_taken_over_and_would_come_out_the_same
     assert policy is run.improved
     repeated, again = attempt(run.session, run.imitator, betas)
     assert curve[again.columns.tolist()].to_numpy() == pytest.approx(again.to_numpy(), rel=1e-6)
-    taken, judged = (stages.judge(run.session, experiments.mode(run.session, one))["objective"] for one in (policy, repeated))
+    taken, judged = (run.session.judge(run.session.fresh(one))["objective"] for one in (policy, repeated))
     assert taken == pytest.approx(judged, rel=1e-6)
     assert experiments.from_imitator(run, [beta / 2 for beta in betas])[0] is not run.improved
 
@@ -133,11 +132,11 @@ def test_a_policy_learned_under_weights_follows_them(prepared):
     session = replace(
         prepared().session, scale_params=prepared().session.scale_params.model_copy(update={"episodes": 60, "epoch_share": 1.0})
     )
-    session = varied(session, features={"beta": 1.0})
+    session = session.varied(features={"beta": 1.0})
     weights = torch.tensor([1.0, 0, 0, 0, 0, 0], dtype=session.dtype)
     means = [
-        session.features.trajectory(experiments.mode(session, policy)).mean(0)[0].item()
-        for policy in (stages.fresh_policy(session), experiments.learn_under(session, weights, 12, "test"))
+        session.features.trajectory(session.fresh(policy)).mean(0)[0].item()
+        for policy in (session.fresh_policy(), experiments.learn_under(session, weights, 12, "test"))
     ]
     assert means[1] > means[0] + 3
 

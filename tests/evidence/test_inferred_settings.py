@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.evidence import inferred_settings
-from helpers.runs.session import open_identification
+from helpers.runs.opening import open_identification
 
 
 @pytest.fixture
@@ -18,7 +18,7 @@ def study(tmp_path):
 
 def test_an_interrupted_search_goes_on_behind_its_last_fit(study, monkeypatch):
     problem, computed = study.problem(study.second), []
-    fit, folder = inferred_settings.fit, study.finished.folder
+    fit, folder = inferred_settings.fit, study.session.finished.folder
     undisturbed = [fit(problem, study.session.scale_params, start) for start in range(2)]
 
     def interrupted(problem, scale, start):
@@ -57,6 +57,6 @@ def test_an_interrupted_profile_is_not_walked_twice(study, monkeypatch):
 
 def test_what_was_kept_goes_when_the_results_are_written(study):
     study.refit(study.problem(study.first), study.filed(study.first))
-    assert study.finished.folder.is_dir()
-    inferred_settings.save(study, {}, {})
-    assert not study.finished.folder.exists()
+    assert study.session.finished.folder.is_dir()
+    study.session.save("inferred_settings", {})
+    assert not study.session.finished.folder.exists()

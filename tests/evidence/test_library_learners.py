@@ -15,7 +15,6 @@ from helpers.evidence.gym_environment import TrackingEnv  # noqa: E402
 from helpers.evidence.library_learners import HeadStartPolicy, LibraryController, TrackingEnvs, learn, library_learner  # noqa: E402
 from helpers.learning.features import tracking_reward  # noqa: E402
 from helpers.plant.rollout import rollout, stream  # noqa: E402
-from helpers.runs import stages  # noqa: E402
 from helpers.runs.session import open_session  # noqa: E402
 from helpers.settings.limits import load_limits  # noqa: E402
 
@@ -125,5 +124,5 @@ def test_an_interrupted_run_does_not_repeat_a_learner_that_has_ended(root, tmp_p
     again = equal_budget.from_library(contest, name)
     assert [episodes for episodes, *_ in first.curve] == [0, 50, 100]
     assert again.curve == first.curve
-    one, other = (stages.fresh_trajectories(contest.session, found.build(contest.session), 20).u for found in (first, again))
+    one, other = (contest.session.fresh(found.build(contest.session), 20).u for found in (first, again))
     assert torch.equal(one, other)

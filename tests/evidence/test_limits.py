@@ -12,7 +12,6 @@ from helpers.evidence.attainable import Tabulated
 from helpers.learning.evaluation import objective
 from helpers.report import limits_answer
 from helpers.report.limits_figures import LABELS, budget_curves, gap_figure, heat_maps, regret_figure
-from helpers.runs import stages
 from helpers.runs.session import open_session
 from tests.evidence.test_experiments import short
 
@@ -68,7 +67,7 @@ def test_what_does_not_learn_keeps_its_value_at_every_budget(contest, learned):
     assert table.columns.tolist() == [0, 12, 24]
     assert (table.loc["mpc"] == table.loc["mpc", 0]).all()
     assert table.notna().all(axis=None)
-    returns = contest.returns(stages.fresh_trajectories(contest.session, contest.session.expert, contest.scale.judged))
+    returns = contest.returns(contest.session.fresh(contest.session.expert, contest.scale.judged))
     assert table.loc["pid_tuned", 0] == pytest.approx(returns.mean().item())  # the search begins with the demonstrator
 
 
@@ -91,9 +90,7 @@ def test_gaps_are_to_the_programme_on_the_same_draws(contest, attained, learned)
     best = table.loc[(30.0, "dynamic_programme")]
     assert (best["gap"], best["gap_low"], best["gap_high"]) == (0.0, 0.0, 0.0)
     exact = limits.without_noise(contest.session)
-    expected = objective(
-        stages.fresh_trajectories(exact, Tabulated(optima[30.0]), contest.scale.draws), exact.features.on("x"), 30.0
-    ).mean()
+    expected = objective(exact.fresh(Tabulated(optima[30.0]), contest.scale.draws), exact.features.on("x"), 30.0).mean()
     assert best["objective"] == pytest.approx(expected.item())
     for _, row in table.iterrows():
         assert row["gap_low"] <= row["gap"] <= row["gap_high"]
@@ -153,7 +150,7 @@ def test_conditions_differ_in_what_they_name(contest):
 def test_nominal_conditions_give_the_nominal_objective(contest):
     table = robustness.robustness(everywhere(contest), {"expert": lambda run: run.expert})
     table = table.set_index(["group", "row", "column"])["objective"]
-    returns = contest.returns(stages.fresh_trajectories(contest.session, contest.session.expert, contest.scale.grid)).mean()
+    returns = contest.returns(contest.session.fresh(contest.session.expert, contest.scale.grid)).mean()
     for key in (("model", "1", "1"), ("noise", "1", "1"), ("set_point", "1", "1"), ("time", "0", "0")):
         assert table[key] == pytest.approx(returns.item())
     assert table["time", "1", "0"] != table["time", "0", "0"]

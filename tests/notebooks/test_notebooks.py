@@ -189,8 +189,8 @@ class Copy:
 def test_changed_numbers_fail_and_changed_style_and_last_digits_pass(tmp_path):
     """All in one run, for each cell is judged alone."""
     copy = Copy("02_offline_irl", tmp_path)
-    wrong = copy.scale_stored("stages.outcome(session", 1 + 1e-3)
-    copy.scale_stored("scores = stages.judge_imitation", 1 + 2e-6)
+    wrong = copy.scale_stored("session.outcome(", 1 + 1e-3)
+    copy.scale_stored("scores = session.judge_imitation", 1 + 2e-6)
     copy.append("curves = figures", "_ = [line.set(color='black', linewidth=4) for axis in curves.axes for line in axis.lines]")
     copy.append("tracking = figures", "tracking.axes[0].lines[0].set_ydata(tracking.axes[0].lines[0].get_ydata() * 1.001)")
     plotted, _ = copy.cell("drawn_summary(tracking)")

@@ -249,11 +249,9 @@ def changes_of_files(draw):
 
 
 @pytest.fixture(scope="module")
-def stage_of(tmp_path_factory, root):
+def stage_of(tmp_path_factory, study):
     """A stage with a table and a policy, and a function that reads all of it."""
-    from conftest import assemble  # noqa: PLC0415
-
-    case = assemble(load(root, 1), torch.float32)
+    case = study(1, torch.float32)
     folder = tmp_path_factory.mktemp("results") / "stage"
     table = pd.DataFrame({"stage": ["a", "b"], "metric": ["c", "d"], "value": [0.1, math.nan]})
     save_stage(folder, {"seed": 1}, {"table.csv": table}, case.policy())
@@ -293,11 +291,9 @@ CELLS = st.one_of(
 
 
 @pytest.fixture(scope="module")
-def recorded(root):
+def recorded(study):
     """A table of demonstrations."""
-    from conftest import assemble  # noqa: PLC0415
-
-    case = assemble(load(root, 1), torch.float64)
+    case = study(1)
     return trajectories_to_table(rollout(case.process, case.pid, case.task, 3, stream(0, "properties")), *NAMES, 0.04)
 
 
@@ -333,7 +329,8 @@ def changes_of_tables(draw):
 @some(0.25)
 @given(change=changes_of_tables(), dtype=st.sampled_from([torch.float32, torch.float64]))
 def test_mutated_tables_of_demonstrations(tmp_path, recorded, change, dtype):
-    stage = save_stage(tmp_path / "stage", {}, texts={"demonstrations.csv": change(recorded)})
+    stage = save_stage(tmp_path / "stage", {}, {"demonstrations.csv": recorded})
+    stage.path("demonstrations.csv").write_text(change(recorded), encoding="utf-8")
     path = stage.path("demonstrations.csv")
     found = outcome(lambda: trajectories_from_table(stage.table("demonstrations.csv"), *NAMES, dtype, path), f"{path}: ")
     if found is not None:

@@ -102,7 +102,7 @@ def test_one_seed_that_fails_stops_no_other_and_is_named_once(small, tmp_path):
     shutil.copytree(place.project / "results", broken.project / "results")
     path = broken.project / "notebooks/02_offline_irl.ipynb"
     notebook = path.read_text(encoding="utf-8")
-    cell = '"demonstrations = stages.load_demonstrations(session)\\n",'
+    cell = '"demonstrations = session.load_demonstrations()\\n",'
     assert notebook.count(cell) == 1
     path.write_text(notebook.replace(cell, f"{cell}\n    \"assert seed != 1, 'this seed fails'\\n\","), encoding="utf-8")
     with (tmp_path / "said").open("wb") as output:

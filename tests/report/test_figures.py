@@ -17,7 +17,7 @@ from matplotlib.transforms import Bbox
 
 from helpers.plant.task import Trajectories
 from helpers.report import drawings, figures
-from helpers.runs import stages
+from helpers.runs.study import response_table
 from helpers.settings.leaf import DEVIATION
 
 OUTPUTS = ("C_A", "T", "level_tank")
@@ -35,7 +35,7 @@ def trajectories(n_loops: int, seed: int) -> Trajectories:
 
 
 def response(n_loops: int = 2) -> pd.DataFrame:
-    return stages.response_table(trajectories(n_loops, 0), trajectories(n_loops, 1), OUTPUTS[:n_loops], INPUTS[:n_loops])
+    return response_table(trajectories(n_loops, 0), trajectories(n_loops, 1), OUTPUTS[:n_loops], INPUTS[:n_loops])
 
 
 def draw(n_loops: int = 2, table: pd.DataFrame | None = None) -> Figure:
@@ -76,7 +76,7 @@ def test_response_table_holds_mean_and_deviation_of_true_states_and_applied_inpu
     x = torch.tensor([[[1.0], [3.0]], [[2.0], [2.0]]])
     u = torch.tensor([[[5.0], [7.0]]])
     batch = Trajectories(x, x + 100, u, u + 100)
-    table = stages.response_table(batch, batch, ("T",), ("T_E",))
+    table = response_table(batch, batch, ("T",), ("T_E",))
     assert list(table.columns) == ["controller", "variable", "kind", "time_index", "mean", "std"]
     for controller in ("agent", "expert"):
         states, inputs = rows_of(table, controller, "T"), rows_of(table, controller, "T_E")

@@ -35,14 +35,14 @@ def folder(tmp_path):
 
 @pytest.fixture
 def saved(folder):
-    return save_stage(folder, {"seed": 3}, {"table.csv": AWKWARD}, texts={"note.txt": "µ"})
+    return save_stage(folder, {"seed": 3}, {"table.csv": AWKWARD, "µ.csv": AWKWARD})
 
 
 def test_tables_come_back_to_the_last_bit(saved):
     found = load_stage(saved.folder, "notebook 01").table("table.csv", ("number", "name"))
     assert found["number"].to_numpy().tobytes() == AWKWARD["number"].to_numpy().tobytes()
     assert saved.record["seed"] == 3
-    assert sorted(saved.record["files"]) == ["note.txt", "table.csv"]
+    assert sorted(saved.record["files"]) == ["table.csv", "µ.csv"]
 
 
 class FaultError(RuntimeError):
@@ -106,7 +106,7 @@ def test_whoever_reads_while_the_same_results_are_written_again_finds_them(saved
         from helpers.runs.artifacts import Path, pd, save_stage
         table = pd.read_csv(sys.argv[2])
         for number in range(150):
-            save_stage(Path(sys.argv[1]), {"seed": number}, {"table.csv": table}, texts={"note.txt": "µ"})
+            save_stage(Path(sys.argv[1]), {"seed": number}, {"table.csv": table, "µ.csv": table})
     """
     writers = [subprocess.Popen([sys.executable, "-c", code, saved.folder, saved.path("table.csv")]) for _ in range(2)]
     reads = 0
@@ -182,7 +182,8 @@ def test_a_file_or_column_that_was_never_written_is_refused(saved):
 
 @pytest.mark.parametrize("text", ["", 'a,b\n1\n2,3,4\n"x'], ids=["empty", "ragged"])
 def test_a_file_that_is_no_table_is_refused(folder, text):
-    stage = save_stage(folder, {}, texts={"table.csv": text})
+    stage = save_stage(folder, {}, {"table.csv": AWKWARD})
+    stage.path("table.csv").write_text(text)
     assert "table.csv" in refusal(stage.table, "table.csv")
 
 

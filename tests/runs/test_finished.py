@@ -13,9 +13,8 @@ from safetensors.torch import load_file, save_file
 
 from helpers.evidence import equal_budget, experiments, limits
 from helpers.learning.learner import Learner
-from helpers.runs import stages
 from helpers.runs.finished import Finished
-from tests.runs.test_stages import session
+from tests.runs.test_study import session
 
 
 def run(folder, variant="improved", dtype="float64"):
@@ -23,17 +22,22 @@ def run(folder, variant="improved", dtype="float64"):
     opened = session(variant=variant)
     few = {"epoch_share": 0.04, "episodes": 20, "measured": 5}
     scale = opened.scale_params.model_copy(update={"number_type": dtype, **few})
-    return replace(opened, scale_params=scale, finished=Finished(folder, opened.finished.identity))
+    return replace(opened, scale_params=scale, output_root=folder)
+
+
+def kept_in(folder):
+    """The files of the trainings that a run has finished."""
+    return list(folder.rglob("*.safetensors"))
 
 
 def offline(opened):
-    result = stages.imitate(opened, stages.load_demonstrations(opened), stages.fresh_policy(opened))
+    result = opened.imitate(opened.load_demonstrations(), opened.fresh_policy())
     return result.records, result.chosen_epoch, [result.weights, *result.policy.state_dict().values()]
 
 
 def online(opened):
-    policy, _ = stages.load_policy(opened, "offline_improved", "02_offline_irl")
-    result = stages.improve(opened, policy, "x")
+    policy, _ = opened.load_policy("offline_improved", "02_offline_irl")
+    result = opened.improve(policy, "x")
     return result.records, 0, list(result.policy.state_dict().values())
 
 
@@ -46,7 +50,7 @@ def budgeted(opened):
     contest = limits.enter(opened)
     small = contest.scale.model_copy(update={"episodes": 200, "every": 50, "judged": 10})
     contest = replace(contest, params=contest.params.model_copy(update={"scales": {"smoke": small}}))
-    result = equal_budget.reinforced(contest, stages.fresh_policy(opened), "scratch", True)
+    result = equal_budget.reinforced(contest, opened.fresh_policy(), "scratch", True)
     return result.curve, 0, list(result.build.args[0].state_dict().values())
 
 
@@ -64,7 +68,7 @@ LEARNING += [pytest.param(*case, marks=pytest.mark.torture) for case in MORE]
 def test_a_finished_training_is_not_repeated_and_comes_back_to_the_last_bit(tmp_path, monkeypatch, learn, variant, dtype):
     first = learn(run(tmp_path, variant, dtype))
     assert first[2][0].dtype == getattr(torch, dtype)
-    assert [path.suffix for path in tmp_path.iterdir()] == [".safetensors"]
+    assert len(kept_in(tmp_path)) == 1
     monkeypatch.setattr(Learner, "realise", lambda _: pytest.fail("an epoch was run again"))
     assert_equal(learn(run(tmp_path, variant, dtype)), first)
 
@@ -78,7 +82,7 @@ def test_a_run_killed_in_its_second_training_repeats_that_one_alone(tmp_path, mo
     child.start()
     child.join()
     assert child.exitcode == -signal.SIGKILL
-    assert len(list((tmp_path / "killed").iterdir())) == 1
+    assert len(kept_in(tmp_path / "killed")) == 1
     epochs, realise = [], Learner.realise
     monkeypatch.setattr(Learner, "realise", lambda learner: epochs.append(learner.epochs) or realise(learner))
     for learn, expected in zip((online, frozen), undisturbed, strict=True):
@@ -96,7 +100,7 @@ def _killed_in_the_second(folder):
 def test_another_training_and_another_run_train_anew(tmp_path):
     for opened, learn in ((run(tmp_path), offline), (run(tmp_path, "printed"), offline), (run(tmp_path), online)):
         learn(opened)
-    assert len(list(tmp_path.iterdir())) == 3
+    assert len(kept_in(tmp_path)) == 3
     kept, calls = Finished(tmp_path / "own", "a"), []
 
     def train():

@@ -233,7 +233,7 @@ def test_plain_papermill_refuses_a_misspelt_parameter(here):
 def source(tmp_path):
     """A copy of what results are made from and of what plans them, to be changed."""
     copy = tmp_path / "copy"
-    for part in ("params", "profiles", "src/helpers", "reports/template"):
+    for part in ("params", "profiles", "rules", "src/helpers", "reports/template"):
         shutil.copytree(PROJECT / part, copy / part, ignore=shutil.ignore_patterns("__pycache__"))
     (copy / "notebooks").mkdir()
     for path in (PROJECT / "Snakefile", *(PROJECT / "notebooks").glob("*.ipynb")):

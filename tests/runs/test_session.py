@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from helpers.runs.artifacts import save_stage
+from helpers.runs.opening import open_report, parameters_hash
 from helpers.runs.request import NOTEBOOK_PARAMETERS, SessionError, check_parameters
-from helpers.runs.session import open_report, open_session, parameters_hash
+from helpers.runs.session import open_session
 from helpers.runs.sources import PROJECT
 from helpers.settings.leaf import ParameterError
 

@@ -6,12 +6,11 @@ from typing import get_args
 import pytest
 import torch
 
-from helpers.runs import stages
+from helpers.runs.opening import parameters_hash
 from helpers.runs.request import SessionError, check_parameters
-from helpers.runs.session import parameters_hash
 from helpers.settings.leaf import read_yaml
 from helpers.settings.paper import TrialParams, load, load_trials
-from tests.runs.test_stages import session
+from tests.runs.test_study import session
 from tests.settings.test_params import DELETE, edit, folder, refusal  # noqa: F401  (a fixture)
 
 TRIALS = "trials.yaml"
@@ -115,7 +114,7 @@ def test_an_unknown_variant_is_refused_without_the_whole_list():
 
 
 def imitated(run):
-    return stages.imitate(run, stages.load_demonstrations(run), stages.fresh_policy(run))
+    return run.imitate(run.load_demonstrations(), run.fresh_policy())
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from helpers.evidence.experiments import Prepared, Scores, copied, economical, gap_to, mode, predictive, varied
+from helpers.evidence.experiments import Prepared, Scores, economical, gap_to, predictive
 from helpers.learning.algorithm_2 import initial_weights
 from helpers.learning.cloning import clone
 from helpers.learning.evaluation import feature_gap, objective
@@ -15,8 +15,7 @@ from helpers.learning.policy import LSTMPolicy
 from helpers.plant.controllers import Controller, Operator
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
-from helpers.runs import stages
-from helpers.runs.session import Session
+from helpers.runs.study import Demonstrations, Study, copied
 
 # What can be learned from --------------------------------------------------------------------------------------------
 
@@ -42,36 +41,36 @@ def feature_sets(prepared: Prepared) -> Scores:
     session, params = prepared.session, prepared.params
     if not prepared.planned(params.feature_sets):
         return {}
-    short = economical(varied(session, offline={"epochs": params.feature_sets.epochs}))
-    expert = session.features.errors(stages.fresh_trajectories(session, session.expert)).mean(1)
+    short = economical(session.varied(offline={"epochs": params.feature_sets.epochs}))
+    expert = session.features.errors(session.fresh(session.expert)).mean(1)
     truth, scores = prepared.expert_features, Scores()
     everything = tuple(range(len(truth)))
     for name, kept in (("type_one", everything[: len(session.task.set_point)]), ("all_types", everything)):
         policy = _matching(prepared, short, kept)
-        fresh, improved = mode(session, policy), stages.improve(session, copied(session, policy), "x").policy
+        fresh, improved = session.fresh(policy), session.improve(copied(policy), "x").policy
         v = session.features.trajectory(fresh).mean(0).double()
         scores[name] = {
             "own_gap": feature_gap(v[list(kept)], truth[list(kept)]),
             "gap": feature_gap(v, truth),
             "distance": (session.features.errors(fresh).mean(1) - expert).square().mean().sqrt().item(),
-            "objective_after_online": stages.judge(session, mode(session, improved))["objective_x"],
+            "objective_after_online": session.judge(session.fresh(improved))["objective_x"],
         }
     return scores
 
 
-def _matching(prepared: Prepared, session: Session, kept: tuple[int, ...]) -> LSTMPolicy:
+def _matching(prepared: Prepared, session: Study, kept: tuple[int, ...]) -> LSTMPolicy:
     """The policy that Algorithm 2 learns when it knows these features only."""
     chosen = SomeFeatures(**vars(session.features), kept=kept)
     start = initial_weights(session.variant_params.weights, len(session.task.set_point), session.dtype)[list(kept)]
-    return stages.imitate(session, prepared.demonstrations, stages.fresh_policy(session), start, chosen).policy
+    return session.imitate(prepared.demonstrations, session.fresh_policy(), start, chosen).policy
 
 
-def record(session: Session, controller: Controller, purpose: str) -> stages.Demonstrations:
+def record(session: Study, controller: Controller, purpose: str) -> Demonstrations:
     """Demonstrations of another controller in the session's task, as notebook 01 records those of the PID."""
     scale = session.scale_params
     trajectories = rollout(session.process, controller, session.task, scale.demonstrations, session.stream("experiments", purpose))
-    truth = stages.judge(session, stages.fresh_trajectories(session, controller, scale.expert_evaluation))
-    return stages.Demonstrations(trajectories, pd.Series(truth))
+    truth = session.judge(session.fresh(controller, scale.expert_evaluation))
+    return Demonstrations(trajectories, pd.Series(truth))
 
 
 def demonstrators(prepared: Prepared) -> Scores:
@@ -81,15 +80,15 @@ def demonstrators(prepared: Prepared) -> Scores:
     return _from_predictive(prepared) | _from_operator(prepared) | _from_rest(prepared)
 
 
-def _learned_from(prepared: Prepared, data: stages.Demonstrations) -> tuple[LSTMPolicy, dict[str, float]]:
+def _learned_from(prepared: Prepared, data: Demonstrations) -> tuple[LSTMPolicy, dict[str, float]]:
     """The policy that Algorithm 2 learns from such data; its gap to them, and the tracking objective of both."""
     session = prepared.session
-    short = economical(varied(session, offline={"epochs": prepared.params.demonstrators.epochs}))
-    learned = stages.imitate(short, data, stages.fresh_policy(session)).policy
-    fresh = mode(session, learned)
+    short = economical(session.varied(offline={"epochs": prepared.params.demonstrators.epochs}))
+    learned = short.imitate(data, session.fresh_policy()).policy
+    fresh = session.fresh(learned)
     return learned, {
         "gap": gap_to(session, fresh, data.true_features(session.feature_names).double()),
-        "objective_x": stages.judge(session, fresh)["objective_x"],
+        "objective_x": session.judge(fresh)["objective_x"],
         "objective_x_of_demonstrator": float(data.scores["objective_x"]),
     }
 
@@ -107,7 +106,7 @@ def _from_operator(prepared: Prepared) -> Scores:
     operator = Operator(session.expert, session.task, params.threshold, held.to(session.dtype))
     data = record(session, operator, "operator")
     learned, figures = _learned_from(prepared, data)
-    own = stages.fresh_trajectories(session, operator)
+    own = session.fresh(operator)
     policies = {"from_operator": learned, "operator_cloned": cloned(prepared, data.trajectories), "from_pid": prepared.imitator}
     misses = {name: {"miss_by_hand": miss_by_hand(own, operator, policy)} for name, policy in policies.items()}
     return misses | {"from_operator": figures | misses["from_operator"]}
@@ -117,12 +116,12 @@ def _from_rest(prepared: Prepared) -> Scores:
     """Data and simulation both begin at the set point and stay there; the gap is to the controller in the task itself."""
     session, params = prepared.session, prepared.params.demonstrators
     spread = tuple(params.rest_std * std for std in session.params.case.initial_std)
-    at_rest = varied(
-        session, case={"initial_mean": session.params.case.set_point, "initial_std": spread}, offline={"epochs": params.epochs}
+    at_rest = session.varied(
+        case={"initial_mean": session.params.case.set_point, "initial_std": spread}, offline={"epochs": params.epochs}
     )
-    learned = stages.imitate(economical(at_rest), record(at_rest, at_rest.expert, "at rest"), stages.fresh_policy(session)).policy
-    fresh = mode(session, learned)
-    objective_x = stages.judge(session, fresh)["objective_x"]
+    learned = economical(at_rest).imitate(record(at_rest, at_rest.expert, "at rest"), session.fresh_policy()).policy
+    fresh = session.fresh(learned)
+    objective_x = session.judge(fresh)["objective_x"]
     return {"from_rest": {"gap": gap_to(session, fresh, prepared.expert_features), "objective_x": objective_x}}
 
 
@@ -147,7 +146,7 @@ def miss_by_hand(trajectories: Trajectories, operator: Operator, policy: LSTMPol
 # How robust imitation is ---------------------------------------------------------------------------------------------
 
 
-def conditions(prepared: Prepared) -> dict[str, Session]:
+def conditions(prepared: Prepared) -> dict[str, Study]:
     """The session as it is, and under conditions that no learning has seen."""
     session, params = prepared.session, prepared.params.conditions
     case, process = session.params.case, session.params.process
@@ -157,9 +156,9 @@ def conditions(prepared: Prepared) -> dict[str, Session]:
     stronger = tuple(params.disturbance_factor * gain for gain in process.disturbance)
     return {
         "nominal": session,
-        "initial_state": varied(session, case={"initial_mean": shifted}),
-        "set_point": varied(session, case={"set_point": target}),
-        "disturbance": varied(session, process={"disturbance": stronger}),
+        "initial_state": session.varied(case={"initial_mean": shifted}),
+        "set_point": session.varied(case={"set_point": target}),
+        "disturbance": session.varied(process={"disturbance": stronger}),
     }
 
 
@@ -167,13 +166,13 @@ def cloned(prepared: Prepared, data: Trajectories) -> LSTMPolicy:
     """The policy that behavioural cloning learns from such data."""
     session, params = prepared.session, prepared.params.cloning
     n_steps, generator = session.epochs(params.steps), session.stream("experiments", "cloning")
-    return clone(stages.fresh_policy(session), data, session.task, params, n_steps, generator).policy
+    return clone(session.fresh_policy(), data, session.task, params, n_steps, generator).policy
 
 
-def first(demonstrations: stages.Demonstrations, n_trajectories: int) -> stages.Demonstrations:
+def first(demonstrations: Demonstrations, n_trajectories: int) -> Demonstrations:
     """Only the first of the recorded trajectories."""
     kept = {name: signal[:, :n_trajectories] for name, signal in vars(demonstrations.trajectories).items()}
-    return stages.Demonstrations(Trajectories(**kept), demonstrations.scores)
+    return Demonstrations(Trajectories(**kept), demonstrations.scores)
 
 
 def robustness(prepared: Prepared) -> Scores:
@@ -190,21 +189,21 @@ def robustness(prepared: Prepared) -> Scores:
     for number in params.cloning.demonstrations:
         policies[f"clone_{number}"] = cloned(prepared, first(prepared.demonstrations, number).trajectories)
     if prepared.planned(params.fewer_demonstrations):
-        short = economical(varied(session, offline={"epochs": params.fewer_demonstrations.epochs}))
+        short = economical(session.varied(offline={"epochs": params.fewer_demonstrations.epochs}))
         for number in params.fewer_demonstrations.demonstrations:
             fewer = first(prepared.demonstrations, number)
-            policies[f"irl_{number}"] = stages.imitate(short, fewer, stages.fresh_policy(session)).policy
+            policies[f"irl_{number}"] = short.imitate(fewer, session.fresh_policy()).policy
     scores: Scores = {}
     for condition, run in conditions(prepared).items():
-        expert = stages.fresh_trajectories(run, run.expert)
+        expert = run.fresh(run.expert)
         truth = run.features.trajectory(expert).mean(0).double()
         aim = _objective(prepared, run, expert)
         for name, policy in policies.items():
-            fresh = mode(run, policy)
+            fresh = run.fresh(policy)
             ratio = _objective(prepared, run, fresh) / aim
             scores[f"{name}:{condition}"] = {"gap": gap_to(run, fresh, truth), "objective_ratio": ratio}
     return scores
 
 
-def _objective(prepared: Prepared, session: Session, trajectories: Trajectories) -> float:
+def _objective(prepared: Prepared, session: Study, trajectories: Trajectories) -> float:
     return objective(trajectories, session.features.on("x"), prepared.params.comparison.beta).mean().item()

@@ -14,23 +14,22 @@ import torch
 from torch import Tensor
 
 from helpers.evidence.alternatives import cloned
-from helpers.evidence.experiments import Prepared, copied
+from helpers.evidence.experiments import Prepared
 from helpers.evidence.mpc import OffsetFreeMPC
 from helpers.learning.algorithm_1 import algorithm_1
 from helpers.learning.evaluation import objective
-from helpers.learning.learner import Learner
 from helpers.learning.policy import LSTMPolicy
 from helpers.plant.controllers import PID, Controller
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
-from helpers.runs import stages
 from helpers.runs.finished import State
 from helpers.runs.session import Session
+from helpers.runs.study import Study, copied
 from helpers.settings.leaf import InputError
 from helpers.settings.limits import LimitsParams, LimitsScaleParams
 from helpers.settings.paper import GainParams
 
-Build = Callable[[Session], Controller]  # the same controller, told of the set point of that session
+Build = Callable[[Study], Controller]  # the same controller, told of the set point of that session
 KINDS = ("proportional", "integral", "derivative")
 CURVE = ("learner", "episodes", "objective", "standard_error")
 
@@ -58,9 +57,8 @@ class Contest:
 
     @property
     def batch(self) -> int:
-        """Plant episodes of an epoch, as online in learning.yaml, fewer at smoke scale."""
-        scale = self.session.scale_params
-        return min(self.session.params.learning.online.episodes, scale.episodes + scale.measured)
+        """Plant episodes of an epoch."""
+        return self.session.online_episodes()
 
     @property
     def beta(self) -> float:
@@ -103,34 +101,30 @@ class Visitor:
 
     def __call__(self, episodes: int, controller: Controller) -> None:
         """Add a point."""
-        returns = self.contest.returns(stages.fresh_trajectories(self.contest.session, controller, self.contest.scale.judged))
+        returns = self.contest.returns(self.contest.session.fresh(controller, self.contest.scale.judged))
         self.curve.append((episodes, returns.mean().item(), returns.std().item() / len(returns) ** 0.5))
 
 
 def reinforced(contest: Contest, start: LSTMPolicy, purpose: str, dense: bool) -> Learned:
     """Algorithm 1 on the real objective with the online settings of learning.yaml, from a given policy."""
     session, visitor = contest.session, Visitor(contest)
-    online, policy = session.params.learning.online, copied(session, start)
-    n_epochs = -(-contest.scale.episodes // contest.batch)
-    policy.reset_exploration(online.exploration)
-    features = session.features.on("x")
-    generator = session.stream("limits", purpose)
-    learner = Learner(policy, session.process, features, online.learner, contest.batch, n_epochs, generator)
+    policy, n_epochs = copied(start), -(-contest.scale.episodes // contest.batch)
+    learner = session.online_learner(policy, contest.batch, n_epochs, session.stream("limits", purpose))
 
     def train() -> State:
-        visitor(0, stages.deploy(session, learner.average))
+        visitor(0, session.deploy(learner.average))
         while learner.epochs < n_epochs:
-            algorithm_1(learner, partial(features.tracking, beta=contest.sharpness(learner.episodes, dense)), 1)
+            algorithm_1(learner, partial(learner.features.tracking, beta=contest.sharpness(learner.episodes, dense)), 1)
             if visitor.due(learner.episodes):
-                visitor(learner.episodes, stages.deploy(session, learner.average))
+                visitor(learner.episodes, session.deploy(learner.average))
         return {"policy": learner.average.state_dict(), "curve": visitor.curve}
 
-    kept = stages.once(session, train, learner, purpose)
-    return Learned(partial(_deployed, stages.restored(policy, kept["policy"])), visitor.read(kept["curve"]))
+    kept = session.trained(train, learner, purpose)
+    return Learned(partial(_deployed, copied(policy, kept["policy"])), visitor.read(kept["curve"]))
 
 
-def _deployed(policy: LSTMPolicy, session: Session) -> Controller:
-    return stages.deploy(session, policy)
+def _deployed(policy: LSTMPolicy, session: Study) -> Controller:
+    return session.deploy(policy)
 
 
 def retuned(contest: Contest) -> Learned:
@@ -151,7 +145,7 @@ def retuned(contest: Contest) -> Learned:
         kinds = np.split(point * unit, 3)
         return start.model_copy(update={name: tuple(kind.tolist()) for name, kind in zip(KINDS, kinds, strict=True)})
 
-    def pid(found: GainParams, run: Session) -> Controller:
+    def pid(found: GainParams, run: Study) -> Controller:
         return PID(found, run.task.set_point, run.params.process.sampling_time)
 
     visitor(0, pid(start, session))
@@ -188,8 +182,8 @@ def from_library(contest: Contest, name: str) -> Learned:
         name, session.process, session.task, policy, params, session.features.params.discount, contest.batch, session.seed
     )
 
-    def build(run: Session) -> Controller:
-        return library.LibraryController(model, run.task, stages.fresh_policy(run).scaling(run.task))
+    def build(run: Study) -> Controller:
+        return library.LibraryController(model, run.task, run.fresh_policy().scaling(run.task))
 
     def visit(episodes: int) -> None:
         if visitor.due(episodes):
@@ -208,7 +202,7 @@ def predictive(contest: Contest) -> Learned:
     """Offset-free MPC, which learns nothing: it has the model of the process instead."""
     params = contest.params.predictive
 
-    def build(run: Session) -> Controller:
+    def build(run: Study) -> Controller:
         nominal = contest.session.process
         return OffsetFreeMPC(nominal, run.task, params.horizon, params.move_penalty, params.disturbance_std)
 
@@ -224,14 +218,14 @@ def learn_all(contest: Contest) -> dict[str, Learned]:
     learned = {
         "irl_reinforce": reinforced(contest, prepared.imitator, "hot", False),
         "clone_reinforce": reinforced(contest, clone, "cloned", False),
-        "scratch_reinforce": reinforced(contest, stages.fresh_policy(contest.session), "scratch", True),
+        "scratch_reinforce": reinforced(contest, contest.session.fresh_policy(), "scratch", True),
         "pid_tuned": retuned(contest),
         "mpc": predictive(contest),
     }
     if contest.scale.library:
         learned |= {name: from_library(contest, name) for name in ("ppo", "recurrent_ppo")}
     visitor = Visitor(contest)
-    visitor(0, stages.deploy(contest.session, clone))
+    visitor(0, contest.session.deploy(clone))
     return {"clone": Learned(partial(_deployed, clone), visitor.curve)} | learned
 
 

@@ -1,14 +1,13 @@
 """The extra runs behind the claims: each verb takes what `prepare` loaded and returns figures of merit by the name of a run.
 
 Every run draws from the same random streams as the stages, so that runs of one seed can be compared with each other. A verb
-whose experiment is not planned for the session's case (params/experiments.yaml) returns nothing.
+whose experiment is not planned for the session's case or seed (params/experiments.yaml) returns nothing.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import pandas as pd
 import torch
@@ -17,16 +16,17 @@ from torch import Tensor
 from helpers.learning.algorithm_1 import algorithm_1
 from helpers.learning.algorithm_2 import apprentice_reward
 from helpers.learning.evaluation import feature_gap
-from helpers.learning.learner import Learner, TrainingError, baseline_regressors, discounted_return, regression_advantage, surrogate
+from helpers.learning.learner import TrainingError, baseline_regressors, discounted_return, regression_advantage, surrogate
 from helpers.learning.policy import LSTMPolicy, PolicyController
 from helpers.plant.controllers import Controller, SaturatedLQ
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
-from helpers.runs import stages
 from helpers.runs.finished import State
 from helpers.runs.progress import ProgressBar
 from helpers.runs.session import Session
+from helpers.runs.study import Demonstrations, Study, copied, history_table
 from helpers.settings.evidence import ComparisonParams, ExperimentCases, ExperimentParams, load_experiments
+from helpers.settings.paper import HEADLINE
 
 Scores = dict[str, dict[str, float]]  # run, metric, value
 
@@ -41,15 +41,15 @@ class Prepared:
 
     session: Session
     params: ExperimentParams
-    demonstrations: stages.Demonstrations
+    demonstrations: Demonstrations
     imitator: LSTMPolicy
     weights: Tensor
     improved: LSTMPolicy
     curve: pd.DataFrame  # of the online learning that gave the improved policy: its history.csv
 
     def planned(self, experiment: ExperimentCases) -> bool:
-        """Whether an experiment is to be run in the session's case."""
-        return self.session.case in experiment.cases
+        """Whether an experiment is to be run in the session's case and for its seed."""
+        return experiment.planned(self.session.case, self.session.seed)
 
     @property
     def expert_features(self) -> Tensor:
@@ -61,12 +61,12 @@ def prepare(session: Session) -> Prepared:
     """What the experiments start from: the results of notebooks 01 to 04 for the session's case."""
     transferred = session.params.case.offline.transfer_from is not None
     kind, made_by = ("transfer", "04_knowledge_transfer") if transferred else ("offline", "02_offline_irl")
-    imitator, weights = stages.load_policy(session, f"{kind}_improved", made_by)
-    online = session.load("online_improved", made_by if transferred else "03_online_improvement")
+    imitator, weights = session.load_policy(f"{kind}_{HEADLINE}", made_by)
+    online = session.load(f"online_{HEADLINE}", made_by if transferred else "03_online_improvement")
     return Prepared(
         session=session,
         params=load_experiments(session.params_root, session.params),
-        demonstrations=stages.load_demonstrations(session),
+        demonstrations=session.load_demonstrations(),
         imitator=imitator,
         weights=weights,
         improved=online.policy(session.params.learning, session.task),
@@ -81,45 +81,16 @@ def plan(prepared: Prepared) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["experiment", "cases", "run here"])
 
 
-def varied(session: Session, **changes: Mapping[str, Any]) -> Session:
-    """The session with entries of its parameters replaced: `case`, `offline`, `online`, `process` or `features`."""
-    params = session.params
-    case = params.case.model_copy(update=dict(changes.get("case", {})))
-    for half in ("offline", "online"):
-        case = case.model_copy(update={half: getattr(case, half).model_copy(update=dict(changes.get(half, {})))})
-    return replace(
-        session,
-        params=replace(
-            params,
-            case=case,
-            process=params.process.model_copy(update=dict(changes.get("process", {}))),
-            features=params.features.model_copy(update=dict(changes.get("features", {}))),
-        ),
-    )
-
-
-def economical(session: Session) -> Session:
+def economical(session: Study) -> Study:
     """The session with fewer episodes an epoch, learned from and measured, for runs that nothing but a claim reads."""
     scale = session.scale_params
     fewer = {name: max(2, round(ECONOMY * getattr(scale, name))) for name in ("episodes", "measured")}
     return replace(session, scale_params=scale.model_copy(update=fewer))
 
 
-def mode(session: Session, policy: LSTMPolicy) -> Trajectories:
-    """Fresh trajectories of a policy's mode in the session's task."""
-    return stages.fresh_trajectories(session, stages.deploy(session, policy))
-
-
-def gap_to(session: Session, trajectories: Trajectories, expert_features: Tensor) -> float:
+def gap_to(session: Study, trajectories: Trajectories, expert_features: Tensor) -> float:
     """The feature gap of trajectories to the features of an expert, shape (d,)."""
     return feature_gap(session.features.trajectory(trajectories).mean(0).double(), expert_features)
-
-
-def copied(session: Session, policy: LSTMPolicy) -> LSTMPolicy:
-    """A policy of the same parameters that may be trained further."""
-    copied = stages.fresh_policy(session)
-    copied.load_state_dict(policy.state_dict())
-    return copied
 
 
 # How controllers respond ---------------------------------------------------------------------------------------------
@@ -133,7 +104,7 @@ def response_figures(session: Session, trajectories: Trajectories, comparison: C
     the mean response travels than from its start to its end, as a share of the set point change (nought without overshoot and
     oscillation, up to noise); tail_error, the mean |e| over both loops at the end.
     """
-    figures = stages.judge(session, trajectories)
+    figures = session.judge(trajectories)
     error = session.features.errors(trajectories)
     mean = error.mean(1)
     outside = (mean.abs() > comparison.band) * torch.arange(1, len(mean) + 1, dtype=mean.dtype)[:, None]
@@ -164,15 +135,12 @@ def responses(prepared: Prepared) -> Scores:
     session = prepared.session
     controllers: dict[str, Controller] = {
         "expert": session.expert,
-        "offline": stages.deploy(session, prepared.imitator),
-        "online": stages.deploy(session, prepared.improved),
+        "offline": session.deploy(prepared.imitator),
+        "online": session.deploy(prepared.improved),
         "predictive": predictive(prepared),
     }
     comparison = prepared.params.comparison
-    return {
-        name: response_figures(session, stages.fresh_trajectories(session, controller), comparison)
-        for name, controller in controllers.items()
-    }
+    return {name: response_figures(session, session.fresh(controller), comparison) for name, controller in controllers.items()}
 
 
 def readings(prepared: Prepared) -> Scores:
@@ -211,10 +179,10 @@ def attempt(session: Session, start: LSTMPolicy, betas: Sequence[float]) -> tupl
     was at the start, and the curve is empty.
     """
     try:
-        result = stages.improve(varied(session, online={"beta": tuple(betas)}), copied(session, start), "x")
+        result = session.varied(online={"beta": tuple(betas)}).improve(copied(start), "x")
     except TrainingError:
         return start, pd.DataFrame({"epochs": [], "episodes": [], "mean_return": []})
-    return result.policy, stages.history_table(result.records, session.feature_names)
+    return result.policy, history_table(result.records, session.feature_names)
 
 
 def from_imitator(prepared: Prepared, betas: Sequence[float]) -> tuple[LSTMPolicy, pd.DataFrame]:
@@ -235,7 +203,7 @@ def online_starts(prepared: Prepared) -> tuple[Scores, pd.DataFrame]:
     rounds = session.params.case.online.epochs
     sharp = [comparison.beta] * len(rounds)
     dense = [session.features.params.beta, *sharp[1:]]
-    untrained = stages.fresh_policy(session)
+    untrained = session.fresh_policy()
     results = {
         "hot": from_imitator(prepared, sharp),
         "scratch": attempt(session, untrained, sharp),
@@ -246,7 +214,7 @@ def online_starts(prepared: Prepared) -> tuple[Scores, pd.DataFrame]:
     scores = {}
     for name, (policy, curve) in results.items():
         reached = first_epoch(curve["epochs"].tolist(), curve["mean_return"].tolist(), level) if name == "hot" else budget
-        figures = response_figures(session, mode(session, policy), comparison)
+        figures = response_figures(session, session.fresh(policy), comparison)
         scores[name] = figures | {"learned": float(len(curve) > 0), "epochs_to_level": float(reached), "epochs": budget}
     return scores, pd.concat([curve.assign(run=name) for name, (_, curve) in results.items()], ignore_index=True)
 
@@ -261,12 +229,12 @@ def sharpness(prepared: Prepared) -> Scores:
     if not prepared.planned(params.beta):
         return {}
     betas, n_rounds = params.beta.betas, len(session.params.case.online.epochs)
-    untrained = stages.fresh_policy(session)
+    untrained = session.fresh_policy()
     runs = {f"hot_beta_{beta:g}": from_imitator(prepared, [beta] * n_rounds) for beta in betas}
     runs |= {f"scratch_beta_{beta:g}": attempt(session, untrained, [beta] * n_rounds) for beta in (betas[0], betas[-1])}
     scores = {}
     for name, (policy, curve) in runs.items():
-        figures = response_figures(session, mode(session, policy), params.comparison)
+        figures = response_figures(session, session.fresh(policy), params.comparison)
         scores[name] = figures | {"learned": float(len(curve) > 0)}
     return scores
 
@@ -282,9 +250,9 @@ def online_budget(prepared: Prepared) -> pd.DataFrame:
         if number == session.params.learning.online.episodes:
             policy, episodes = prepared.improved, int(prepared.curve["episodes"].iloc[-1])
         else:
-            result = stages.improve(session, copied(session, prepared.imitator), "x", number)
+            result = session.improve(copied(prepared.imitator), "x", number)
             policy, episodes = result.policy, result.records[-1].episodes
-        rows.append((number, episodes, stages.judge(session, mode(session, policy))["objective"]))
+        rows.append((number, episodes, session.judge(session.fresh(policy))["objective"]))
     return pd.DataFrame(rows, columns=["episodes_per_epoch", "episodes", "objective"])
 
 
@@ -297,26 +265,26 @@ def transfer(prepared: Prepared) -> Scores:
     if session.params.case.offline.transfer_from is None:
         return {}
     made_by = {"transfer": "04_knowledge_transfer", "offline": "02_offline_irl"}
-    histories = {kind: session.load(f"{kind}_improved", notebook).table("history.csv") for kind, notebook in made_by.items()}
+    histories = {kind: session.load(f"{kind}_{HEADLINE}", notebook).table("history.csv") for kind, notebook in made_by.items()}
     smooth = {kind: history["feature_gap"].rolling(5, min_periods=1).mean() for kind, history in histories.items()}
     least = smooth["offline"].min()
     epochs = {kind: float(first_epoch(histories[kind]["epochs"].tolist(), (-gap).tolist(), -least)) for kind, gap in smooth.items()}
     return {"transfer": {"epochs_to_level": epochs["transfer"]}, "from_scratch": {"epochs_to_level": epochs["offline"]}}
 
 
-def learn_under(session: Session, weights: Tensor, n_epochs: int, label: str) -> LSTMPolicy:
+def learn_under(session: Study, weights: Tensor, n_epochs: int, label: str) -> LSTMPolicy:
     """Algorithm 1 from an untrained policy under a reward whose weights stay as they are."""
     generator, params = session.stream("experiments", "frozen"), session.variant_params.learner
     n_episodes = economical(session).scale_params.episodes
-    policy = stages.fresh_policy(session)
-    learner = Learner(policy, session.process, session.features, params, n_episodes, n_epochs, generator)
+    policy = session.fresh_policy()
+    learner = session.learner(policy, n_episodes, n_epochs, params, generator)
     reward = partial(apprentice_reward, features=session.features, weights=weights)
 
     def train() -> State:
         algorithm_1(learner, reward, n_epochs, params.patience, ProgressBar(n_epochs, label))
         return {"policy": learner.average.state_dict()}
 
-    return stages.restored(policy, stages.once(session, train, learner, weights)["policy"])
+    return copied(policy, session.trained(train, learner, weights)["policy"])
 
 
 def frozen_weights(prepared: Prepared) -> Scores:
@@ -332,10 +300,10 @@ def frozen_weights(prepared: Prepared) -> Scores:
     if session.published is not None:
         runs["frozen_published"] = (session, torch.tensor(session.published.alpha, dtype=session.dtype))
     if prepared.planned(params.undiscounted):
-        runs["frozen_undiscounted"] = (varied(session, features={"discount": 1.0}), prepared.weights)
-    expert, gamma = stages.fresh_trajectories(session, session.expert), session.features.params.discount
+        runs["frozen_undiscounted"] = (session.varied(features={"discount": 1.0}), prepared.weights)
+    expert, gamma = session.fresh(session.expert), session.features.params.discount
     for name, (run, weights) in runs.items():
-        fresh = mode(session, learn_under(run, weights, session.epochs(params.frozen_weights.epochs), name))
+        fresh = session.fresh(learn_under(run, weights, session.epochs(params.frozen_weights.epochs), name))
         rewards, of_expert = (apprentice_reward(batch, session.features, weights) for batch in (fresh, expert))
         scores[name] = response_figures(session, fresh, params.comparison) | {
             "gap": gap_to(session, fresh, prepared.expert_features),
@@ -355,7 +323,7 @@ def gradient_spread(prepared: Prepared) -> Scores:
     session, params = prepared.session, prepared.params.baseline
     if not prepared.planned(params):
         return {}
-    policy, generator = copied(session, prepared.imitator), session.stream("experiments", "baseline")
+    policy, generator = copied(prepared.imitator), session.stream("experiments", "baseline")
     policy.reset_exploration()
     gamma, beta = session.features.params.discount, prepared.params.comparison.beta
     gradients: dict[str, list[Tensor]] = {"none": [], "mean": [], "regression": []}

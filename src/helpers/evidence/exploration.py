@@ -8,13 +8,11 @@ import torch
 from torch import Tensor
 
 from helpers.evidence.equal_budget import Contest
-from helpers.evidence.experiments import copied
 from helpers.learning.algorithm_1 import algorithm_1
-from helpers.learning.learner import Learner
 from helpers.learning.policy import LSTMPolicy
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
-from helpers.runs import stages
+from helpers.runs.study import copied
 
 
 @dataclass(frozen=True)
@@ -41,19 +39,16 @@ def exploring_episodes(contest: Contest) -> pd.DataFrame:
     online = contest.session.params.case.online
     starts = {
         "hot": (contest.prepared.imitator, online.beta),
-        "scratch": (stages.fresh_policy(contest.session), (contest.params.dense.beta, *online.beta[1:])),
+        "scratch": (contest.session.fresh_policy(), (contest.params.dense.beta, *online.beta[1:])),
     }
     return pd.concat([_explore(contest, name, *start) for name, start in starts.items()], ignore_index=True)
 
 
 def _explore(contest: Contest, run: str, start: LSTMPolicy, betas: tuple[float, ...]) -> pd.DataFrame:
     session = contest.session
-    online, generator = session.params.learning.online, session.stream("limits", "safety")
+    generator = session.stream("limits", "safety")
     epochs = [session.epochs(n_epochs) for n_epochs in session.params.case.online.epochs]
-    policy = copied(session, start)
-    policy.reset_exploration(online.exploration)
-    features = session.features.on("x")
-    learner = Learner(policy, session.process, features, online.learner, contest.batch, sum(epochs), generator)
+    learner = session.online_learner(copied(start), contest.batch, sum(epochs), generator)
     frames = []
     for n_epochs, beta in zip(epochs, betas, strict=True):
         for _ in range(n_epochs):

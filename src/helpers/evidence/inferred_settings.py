@@ -11,16 +11,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from helpers.evidence.identification import Fit, Problem, Profile, fit, polish, profile, refit
 from helpers.evidence.readings import GAINS, MAIN, READINGS, TIME, Key, Reading, Values, Vector, simulate
 from helpers.learning.features import feature_names
 from helpers.plant.rollout import stream
-from helpers.runs import artifacts
-from helpers.runs.finished import Finished
-from helpers.runs.identity import digest
-from helpers.runs.session import IdentificationSession
+from helpers.runs.opening import IdentificationSession
 from helpers.settings.paper import Params
 
 FINAL_TOLERANCE = 1.0e-7
@@ -36,7 +32,6 @@ class Study:
 
     session: IdentificationSession
     sampling_error: Mapping[int, Vector]
-    finished: Finished
 
     @property
     def first(self) -> str:
@@ -129,7 +124,7 @@ class Study:
 
     def _once(self, compute: Callable[[], Mapping[str, Vector]], *what: Any) -> dict[str, Vector]:
         """Numbers that an interrupted run has left, or else what is computed now."""
-        state = self.finished.once(lambda: {name: values.tolist() for name, values in compute().items()}, *what)
+        state = self.session.finished.once(lambda: {name: values.tolist() for name, values in compute().items()}, *what)
         return {name: np.array(values) for name, values in state.items()}
 
     def best(self, problem: Problem, fits: Sequence[Fit]) -> Fit:
@@ -165,16 +160,7 @@ def _what(problem: Problem) -> tuple[Any, ...]:
 
 def study(session: IdentificationSession) -> Study:
     """What every fit starts from."""
-    folder = session.output_root / session.scale / f"seed_{session.seed}" / f".finished_{session.notebook}"
-    finished = Finished(folder, digest([session.made_from, session.seed, session.scale]))
-    return Study(session, sampling_errors(session, MAIN), finished)
-
-
-def save(study: Study, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, Figure]) -> artifacts.Stage:
-    """Write the results; fits and profiles that were kept on the way are removed."""
-    stage = study.session.save(tables, figures)
-    study.finished.remove()
-    return stage
+    return Study(session, sampling_errors(session, MAIN))
 
 
 def sampling_errors(session: IdentificationSession, reading: Reading) -> dict[int, Vector]:

@@ -8,15 +8,15 @@ from torch import Tensor
 
 from helpers.evidence.attainable import Optimum, Resolution, Tabulated, dynamic_programme, grid_around
 from helpers.evidence.equal_budget import Build, Contest, Learned
-from helpers.evidence.experiments import Prepared, prepare, varied
+from helpers.evidence.experiments import Prepared, prepare
 from helpers.evidence.kalman import Filtered
 from helpers.learning.control_quality import harris_index, quality
 from helpers.learning.evaluation import objective
 from helpers.plant.controllers import Controller
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
-from helpers.runs import stages
 from helpers.runs.session import Session
+from helpers.runs.study import Study
 from helpers.settings.limits import load_limits
 
 NORMAL = 1.96  # half the width of a 95 % interval, in standard errors
@@ -29,10 +29,10 @@ def enter(session: Session) -> Contest:
     return Contest(prepared, load_limits(session.params_root, session.params))
 
 
-def without_noise(session: Session) -> Session:
+def without_noise(session: Study) -> Study:
     """The session with an observation that is the state."""
     exact = tuple(0.0 for _ in session.params.process.observation_noise)
-    return varied(session, process={"observation_noise": exact})
+    return session.varied(process={"observation_noise": exact})
 
 
 # The attainable ------------------------------------------------------------------------------------------------------
@@ -47,14 +47,14 @@ def attain(contest: Contest, beta: float) -> tuple[Optimum, pd.DataFrame]:
     """
     params, scale, session = contest.params.attainable, contest.scale, without_noise(contest.session)
     features = session.features.on("x")
-    reference = stages.fresh_trajectories(session, session.minimum_variance, scale.draws)
+    reference = session.fresh(session.minimum_variance, scale.draws)
     least = objective(reference, features, beta).double().mean().item()
     rows: list[dict[str, float]] = []
     for states, inputs in zip(scale.states, scale.inputs, strict=True):
         axes = grid_around(reference.x, states, params.margin)
         resolution = Resolution(states, inputs, params.nodes)
         optimum = dynamic_programme(session.process, session.task, beta, features.params.discount, axes, resolution)
-        greedy = stages.fresh_trajectories(session, Tabulated(optimum), scale.draws)
+        greedy = session.fresh(Tabulated(optimum), scale.draws)
         returns = objective(greedy, features, beta).double()
         value, found = optimum.value_at(greedy.x[0]).mean().item(), returns.mean().item()
         gap = value / found - 1
@@ -81,7 +81,7 @@ def known_process(contest: Contest, optimum: Optimum | None = None, stationary: 
     """
     nominal = contest.session.process
 
-    def filtered(controller: Controller, run: Session) -> Controller:
+    def filtered(controller: Controller, run: Study) -> Controller:
         return Filtered(controller, nominal, run.task)
 
     builds: dict[str, Build] = {
@@ -100,8 +100,8 @@ def of_the_paper(contest: Contest) -> dict[str, Build]:
     prepared = contest.prepared
     return {
         "expert": lambda run: run.expert,
-        "offline": lambda run: stages.deploy(run, prepared.imitator),
-        "online": lambda run: stages.deploy(run, prepared.improved),
+        "offline": lambda run: run.deploy(prepared.imitator),
+        "online": lambda run: run.deploy(prepared.improved),
     }
 
 
@@ -126,7 +126,7 @@ def gaps(contest: Contest, optima: Mapping[float, Optimum], learned: Mapping[str
 
 def _full(contest: Contest, name: str, build: Build) -> Trajectories:
     session = without_noise(contest.session) if name in ON_STATE else contest.session
-    return stages.fresh_trajectories(session, build(session), contest.scale.draws)
+    return session.fresh(build(session), contest.scale.draws)
 
 
 def _interval(values: Tensor) -> dict[str, float]:
@@ -154,9 +154,9 @@ def control_quality(contest: Contest, builds: Mapping[str, Build], stationary: M
     rows = []
     for name, build in builds.items():
         run = without_noise(session) if name in ON_STATE else session
-        batch = stages.fresh_trajectories(run, build(run), scale.judged)
+        batch = run.fresh(build(run), scale.judged)
         figures = quality(batch, run.features, params, process.controlled, process.manipulated)
-        long = varied(run, case=at_rest, process={"horizon": scale.at_rest})
+        long = run.varied(case=at_rest, process={"horizon": scale.at_rest})
         single = rollout(long.process, stationary.get(name, build)(long), long.task, 1, long.stream("limits", "at rest"))
         deviation = (single.y[1:, 0] - long.task.set_point).double().numpy()
         figures |= {

@@ -6,15 +6,13 @@ from typing import NamedTuple
 import pandas as pd
 
 from helpers.evidence.equal_budget import Build, Contest
-from helpers.evidence.experiments import copied, varied
 from helpers.evidence.mismatch import Delayed, LoadStep
 from helpers.learning.evaluation import objective
 from helpers.plant.controllers import Controller
 from helpers.plant.process import Process
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
-from helpers.runs import stages
-from helpers.runs.session import Session
+from helpers.runs.study import Study, copied
 
 
 class Condition(NamedTuple):
@@ -28,8 +26,8 @@ class Condition(NamedTuple):
     group: str
     row: str
     column: str
-    told: Session
-    plant: Session
+    told: Study
+    plant: Study
     load: float = 0.0
     dead_time: int = 0
 
@@ -52,13 +50,13 @@ def conditions(contest: Contest) -> list[Condition]:
                 "disturbance": tuple(disturbance * gain for gain in process.disturbance),
                 "observation_noise": tuple(noise * std for std in process.observation_noise),
             }
-            plant = varied(session, process=changes)
+            plant = session.varied(process=changes)
             found.append(Condition("noise", f"{disturbance:g}", f"{noise:g}", session, plant))
     for first in grids["set_point_factors"]:
         for others in grids["set_point_factors"]:
             factors = [first, *[others] * (len(case.set_point) - 1)]
             target = tuple(factor * value for factor, value in zip(factors, case.set_point, strict=True))
-            told = varied(session, case={"set_point": target})
+            told = session.varied(case={"set_point": target})
             found.append(Condition("set_point", f"{first:g}", f"{others:g}", told, told))
     for dead_time in (0, params.dead_time):
         for load in (0.0, params.load):
@@ -66,12 +64,12 @@ def conditions(contest: Contest) -> list[Condition]:
     return found
 
 
-def mismatched(session: Session, state: float, entry: float) -> Session:
+def mismatched(session: Study, state: float, entry: float) -> Study:
     """The session with A and B of Eq. 4.1.3b scaled."""
     process = session.params.process
     drift_state = tuple(tuple(state * value for value in row) for row in process.drift_state)
     drift_input = tuple(tuple(entry * value for value in row) for row in process.drift_input)
-    return varied(session, process={"drift_state": drift_state, "drift_input": drift_input})
+    return session.varied(process={"drift_state": drift_state, "drift_input": drift_input})
 
 
 def robustness(contest: Contest, builds: Mapping[str, Build]) -> pd.DataFrame:
@@ -107,15 +105,15 @@ def improved_on_mismatch(contest: Contest) -> pd.DataFrame:
     params, prepared, rows = contest.params.robustness, contest.prepared, []
     for state, entry in zip(params.improve_state, params.improve_input, strict=True):
         plant = mismatched(contest.session, state, entry)
-        improved = stages.improve(plant, copied(plant, prepared.imitator), "x").policy
+        improved = plant.improve(copied(prepared.imitator), "x").policy
         controllers: dict[str, Controller] = {
             "expert": plant.expert,
-            "offline": stages.deploy(plant, prepared.imitator),
-            "online": stages.deploy(plant, prepared.improved),
-            "online_there": stages.deploy(plant, improved),
+            "offline": plant.deploy(prepared.imitator),
+            "online": plant.deploy(prepared.improved),
+            "online_there": plant.deploy(improved),
             "minimum_variance": contest.session.minimum_variance,
         }
         for name, controller in controllers.items():
-            batch = stages.fresh_trajectories(plant, controller, contest.scale.judged)
+            batch = plant.fresh(controller, contest.scale.judged)
             rows.append((state, entry, name, contest.returns(batch).mean().item()))
     return pd.DataFrame(rows, columns=["state", "input", "controller", "objective"])

@@ -12,14 +12,14 @@ from helpers.report import claims, scorecard
 from helpers.runs.artifacts import RECORD, Stage, load_stage
 from helpers.runs.freshness import check
 from helpers.runs.identity import inputs
-from helpers.settings.paper import Params, PublishedCase, load, load_published
+from helpers.settings.paper import HEADLINE, Params, PublishedCase, load, load_published
 
-DEMONSTRATIONS, ONLINE, BUDGET, EXPERIMENTS = "demonstrations", "online_improved", "online_budget", "experiments"
-OFFLINE = {"offline": "improved", "offline_printed": "printed"}  # stage in seeds.csv and the variant behind it
+DEMONSTRATIONS, ONLINE, BUDGET, EXPERIMENTS = "demonstrations", f"online_{HEADLINE}", "online_budget", "experiments"
+OFFLINE = {"offline": HEADLINE, "offline_printed": "printed"}  # stage in seeds.csv and the variant behind it
 REPORT = "05_report"
 INFERRED = "inferred_settings"  # which has no case, and stands with the first seed
 LIMITS = ("attainable", "budget", "quality", "robustness", "safety")  # the parts of notebook 06, the last one written last
-SCRATCH = "offline_improved"  # of a case that starts from another: the same learning without the transfer
+SCRATCH = f"offline_{HEADLINE}"  # of a case that starts from another: the same learning without the transfer
 MADE_BY = {"demonstrations": "01", "offline": "02", "online": "03 (04 for the transfer case)", "transfer": "04"}
 
 
@@ -75,7 +75,7 @@ class Results:
         rows = self.medians.query("case == @case and stage == @stage and metric == @metric")
         return float(rows["median"].iloc[0]) if len(rows) else float("nan")
 
-    def offline_folder(self, case: int, variant: str = "improved") -> str:
+    def offline_folder(self, case: int, variant: str = HEADLINE) -> str:
         """The folder of a case's offline learning."""
         return _offline_folder(self.params[case], variant)
 
@@ -185,9 +185,10 @@ def _claims(root: Path, params_root: Path, scale: str, seeds: Sequence[int]) -> 
 
 
 def _budget(found: Mapping[tuple[int, int], Stage]) -> pd.DataFrame:
-    """The objective after online learning by the episodes of an epoch, where that was run."""
+    """The objective after online learning by the episodes of an epoch, where that was run: not for all seeds."""
     columns = ("episodes_per_epoch", "objective")
-    frames = [stage.table("scores.csv", columns).assign(seed=seed, case=case) for (case, seed), stage in found.items()]
+    tables = ((stage.table("scores.csv", columns), *place) for place, stage in found.items())
+    frames = [table.assign(seed=seed, case=case) for table, case, seed in tables if len(table)]
     order = ["seed", "case", *columns]
     return pd.concat(frames, ignore_index=True)[order] if frames else pd.DataFrame(columns=order)
 

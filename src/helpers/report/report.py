@@ -22,9 +22,9 @@ from helpers.report import drawings, figures, limits_findings, limits_report, sc
 from helpers.report.collection import ONLINE, Results
 from helpers.runs.artifacts import ArtifactError, code_revision
 from helpers.runs.identity import digest, versions
+from helpers.runs.opening import parameters_hash
 from helpers.runs.pictures import smaller
 from helpers.runs.scratch import beside, sweep
-from helpers.runs.session import parameters_hash
 from helpers.runs.sources import PROJECT
 from helpers.settings.paper import OnlineParams
 

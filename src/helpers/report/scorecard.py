@@ -7,13 +7,12 @@ import pandas as pd
 
 from helpers.report.statistics import median_interval, prediction_interval
 from helpers.report.tables import NOT_KNOWN, RESULT_DECIMALS, ROMAN, feature_symbol
-from helpers.settings.paper import PublishedCase
+from helpers.settings.paper import HEADLINE, PublishedCase
 
 REPRODUCED_BY = {"expert": ("expert", "v"), "policy": ("offline", "v"), "alpha": ("offline", "alpha")}  # stage, metric
 MINIMUM_VARIANCE = "minimum_variance"  # the stage of the controller to measure online learning by
 FITTED = "expert"  # this row's settings were inferred from the very numbers that it is compared with
 ROWS = {"expert": "features of the expert", "policy": "features of the policy", "alpha": "weights"}
-HEADLINE = "improved"  # the variant that trials are compared with
 VERDICTS = ("match", "differs", "cannot tell", "fitted")
 WIDEST = 0.25  # half the width of a prediction interval that can still tell, as a share of the published value
 PUBLISHED_TRAJECTORIES = 500  # behind a published feature, Section 5.1.1

@@ -88,7 +88,6 @@ def save_stage(
     tables: Mapping[str, pd.DataFrame] | None = None,
     policy: LSTMPolicy | None = None,
     figures: Mapping[str, Figure] | None = None,
-    texts: Mapping[str, str] | None = None,
 ) -> Stage:
     """Write a stage's results into `folder`, all of them or none, and return what was written.
 
@@ -101,7 +100,7 @@ def save_stage(
         tables: file names ending in .csv and their tables; `figures`: names without ending, written as SVG and PNG.
     """
     folder = folder.resolve()
-    for name in (*(tables or {}), *(figures or {}), *(texts or {})):
+    for name in (*(tables or {}), *(figures or {})):
         if Path(name).name != name or name == "..":
             raise ArtifactError(f"{folder}: the file name '{name}' leads out of the stage's folder")
     partial = beside(folder)
@@ -111,8 +110,6 @@ def save_stage(
         partial.mkdir(parents=True)
         for name, frame in (tables or {}).items():
             frame.to_csv(partial / name, index=False, float_format=FLOATS)
-        for name, text in (texts or {}).items():
-            (partial / name).write_text(text, encoding="utf-8")
         if policy is not None:
             (partial / "policy.safetensors").write_bytes(save_tensors(policy.state_dict()))
         for name, figure in (figures or {}).items():

@@ -7,6 +7,7 @@ from typing import Any
 from helpers.runs.artifacts import RECORD, ArtifactError, Stage
 from helpers.runs.identity import UNKNOWN, changes, identity, inputs
 from helpers.runs.sources import PROJECT
+from helpers.settings.paper import HEADLINE
 
 COMMITTED = PROJECT / "notebooks/inputs"  # made at another commit, on another machine: only their parameters are compared
 MOST_NAMED = 5  # of the files in one sentence
@@ -30,7 +31,7 @@ def check(stages: Sequence[Stage], folder: Path, params_root: Path) -> None:
         run: dict[str, Any] = {name: record[name] for name in ("notebook", "case", "seed", "scale", "variant") if name in record}
         if "notebook" not in run:
             raise ArtifactError(f"{stage.folder / RECORD}: this result does not say what made it; run it again")
-        key = run["notebook"], run.get("case"), run.get("variant", "improved")
+        key = run["notebook"], run.get("case"), run.get("variant", HEADLINE)
         if key not in now:
             now[key] = inputs(key[0], params_root, folder.name, key[1], key[2])
         found = changes(record, now[key])

@@ -15,6 +15,7 @@ from typing import Any
 
 from helpers.runs.sources import PROJECT, REPORT, code_behind
 from helpers.settings.leaf import LEAF_KEYS, read_yaml
+from helpers.settings.paper import HEADLINE
 
 PACKAGES = ("torch", "numpy", "scipy", "pandas", "cma", "safetensors", "sympy", "pydantic", "ruamel.yaml", "matplotlib", "seaborn")
 DRAWING = ("matplotlib", "seaborn")  # they shape what the report shows and no result
@@ -49,7 +50,7 @@ def inputs(
     params_root: Path,
     scale: str,
     case: int | None = None,
-    variant: str = "improved",
+    variant: str = HEADLINE,
     project: Path = PROJECT,
 ) -> dict[str, str]:
     """What a notebook's results are made from beside earlier results: file or package, and its hash or version.

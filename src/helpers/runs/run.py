@@ -27,11 +27,11 @@ from helpers.runs.request import SessionError, check_parameters, check_place
 from helpers.runs.scratch import beside, sweep
 from helpers.runs.sources import PROJECT
 from helpers.settings.leaf import ParameterError
+from helpers.settings.paper import HEADLINE
 
 NOTEBOOKS = PROJECT / "notebooks"
 DAY = 86400.0  # seconds
 COMMITTED = ("reports/template", "reports/reference")  # where no notebook writes: people do, and make publish, bench and torture
-HEADLINE = "improved"  # the variant behind the report's numbers; cells with this tag are run for it alone
 
 
 def execute(notebook: str, output: Path, parameters: dict[str, Any]) -> None:
@@ -55,7 +55,7 @@ def execute(notebook: str, output: Path, parameters: dict[str, Any]) -> None:
         # Papermill has every output by the time it stops the kernel, so the kernel need not take itself apart first.
         config.NotebookClient.shutdown_kernel = "immediate"
         if parameters.get("variant", HEADLINE) != HEADLINE:
-            config.NotebookClient.skip_cells_with_tag = HEADLINE  # what only the headline variant is needed for
+            config.NotebookClient.skip_cells_with_tag = HEADLINE  # cells with the variant's name are for it alone
         if os.name == "posix":
             config.KernelManager.transport = "ipc"
             config.KernelManager.ip = str(Path(sockets) / "k")

@@ -34,9 +34,14 @@ class ComparisonParams(Record):
 
 
 class ExperimentCases(Record):
-    """The cases in which an experiment is run."""
+    """The cases in which an experiment is run, and for how many seeds, from the first on; without `seeds` for all."""
 
     cases: Annotated[tuple[Count, ...], Leaf("case")]
+    seeds: Annotated[Count, Leaf("seeds")] | None = None
+
+    def planned(self, case: int, seed: int) -> bool:
+        """Whether it is to be run for this case and seed."""
+        return case in self.cases and (self.seeds is None or seed < self.seeds)
 
 
 class FrozenWeightsParams(ExperimentCases):

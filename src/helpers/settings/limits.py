@@ -121,8 +121,9 @@ class LimitsScaleParams(Record):
 
 
 class LimitsParams(Record):
-    """params/limits.yaml."""
+    """params/limits.yaml; `seeds`: how many, from the first on, notebook 06 is run for, whatever the number of the others."""
 
+    seeds: Annotated[Count, Leaf("seeds")]
     attainable: AttainableParams
     predictive: PredictiveParams
     ppo: LibraryParams

@@ -30,6 +30,8 @@ from helpers.settings.leaf import (
     validate,
 )
 
+HEADLINE = "improved"  # the variant of Algorithms 1 and 2 behind the report's numbers, with which all others are compared
+
 
 class BalanceParams(Record):
     """The groups of the material and energy balance behind Eq. 4.1.3b."""

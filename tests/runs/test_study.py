@@ -13,10 +13,10 @@ import torch
 from safetensors.torch import save as save_tensors
 
 from helpers.learning.policy import LSTMPolicy
-from helpers.runs import stages
 from helpers.runs.artifacts import ArtifactError
-from helpers.runs.session import open_session
+from helpers.runs.session import Session, open_session
 from helpers.runs.sources import PROJECT
+from helpers.runs.study import cost, history_table, score_table, weight_table
 
 EPOCHS_OF_THE_PAPER = {1: (300, [10, 10]), 2: (250, [10, 10]), 3: (80, [10, 10])}
 EPISODES_OF_AN_EPOCH = 500
@@ -43,9 +43,9 @@ def session(case=1, variant="improved", scale="smoke", **given):
 def learn(case=1, variant="improved"):
     """Offline, then online, as notebooks 02 and 03 do; a hash of all that was learned comes with it."""
     run = session(case, variant)
-    demonstrations = stages.load_demonstrations(run)
-    offline = stages.imitate(run, demonstrations, stages.fresh_policy(run))
-    online = stages.improve(run, copy.deepcopy(offline.policy), "x")
+    demonstrations = run.load_demonstrations()
+    offline = run.imitate(demonstrations, run.fresh_policy())
+    online = run.improve(copy.deepcopy(offline.policy), "x")
     learned = b"".join(save_tensors(result.policy.state_dict()) for result in (offline, online)) + offline.weights.numpy().tobytes()
     return run, demonstrations, offline, online, hashlib.sha256(learned).hexdigest()
 
@@ -71,8 +71,8 @@ def test_demonstrations_are_what_notebook_01_recorded(learned):
 
 def test_figures_of_merit_have_the_names_that_the_report_reads(learned):
     run, demonstrations, offline, online, _ = learned
-    trajectories = stages.fresh_trajectories(run, stages.deploy(run, offline.policy))
-    imitation = stages.judge_imitation(run, trajectories, demonstrations, offline)
+    trajectories = run.fresh(offline.policy)
+    imitation = run.judge_imitation(trajectories, demonstrations, offline)
     expected = (
         CONTROL | COST | {"feature_gap", "chosen_epoch"} | {f"{kind}:{name}" for kind in ("gap", "alpha") for name in FEATURES}
     )
@@ -80,9 +80,9 @@ def test_figures_of_merit_have_the_names_that_the_report_reads(learned):
     gaps = [abs(imitation[f"gap:{name}"]) for name in FEATURES]
     assert imitation["feature_gap"] == pytest.approx(sum(gaps) / len(gaps))
     assert sum(imitation[f"alpha:{name}"] ** 2 for name in FEATURES) == pytest.approx(1)
-    improvement = stages.judge_improvement(run, trajectories, online)
+    improvement = run.judge(trajectories) | cost(online.records[-1])
     assert improvement.keys() == CONTROL | COST
-    table = stages.score_table({"offline": imitation, "online": improvement})
+    table = score_table({"offline": imitation, "online": improvement})
     assert list(table) == ["stage", "metric", "value"]
     assert len(table) == len(imitation) + len(improvement)
     assert table["value"].map(lambda value: isinstance(value, (int, float))).all()
@@ -93,7 +93,7 @@ def test_the_steps_that_notebook_02_shows_are_those_of_the_verb(learned):
     run, _, offline, *_ = learned
     stored = run.load("offline_improved", "02_offline_irl")
     assert stored.table("weights.csv")["alpha"].tolist() == pytest.approx(offline.weights.tolist(), rel=1e-6)
-    history, own = stored.table("history.csv"), stages.history_table(offline.records, run.feature_names)
+    history, own = stored.table("history.csv"), history_table(offline.records, run.feature_names)
     assert list(history) == list(own)
     assert history.to_numpy() == pytest.approx(own.to_numpy(), rel=1e-6)
     kept = stored.policy(run.params.learning, run.task).state_dict()
@@ -103,13 +103,13 @@ def test_the_steps_that_notebook_02_shows_are_those_of_the_verb(learned):
 
 def test_records_of_learning_become_tables(learned):
     run, _, offline, online, _ = learned
-    history = stages.history_table(offline.records, run.feature_names)
+    history = history_table(offline.records, run.feature_names)
     counted = ["iteration", "epochs", "episodes", "gradient_steps"]
     assert list(history)[:4] == counted
     assert {"mean_return", "feature_gap", "learning_rate", "policy_std", *(f"alpha:{name}" for name in FEATURES)} <= set(history)
     assert (history[counted].diff().iloc[1:] > 0).all(axis=None)
-    assert list(stages.history_table(online.records, run.feature_names)["epochs"]) == [1, 2]
-    weights = stages.weight_table(run.feature_names, offline.weights)
+    assert list(history_table(online.records, run.feature_names)["epochs"]) == [1, 2]
+    weights = weight_table(run.feature_names, offline.weights)
     assert dict(zip(weights["feature"], weights["alpha"], strict=True)) == dict(
         zip(run.feature_names, offline.weights.tolist(), strict=True)
     )
@@ -117,7 +117,7 @@ def test_records_of_learning_become_tables(learned):
 
 def test_every_controller_meets_the_same_disturbances(learned):
     run, _, offline, *_ = learned
-    expert, agent = (stages.fresh_trajectories(run, controller) for controller in (run.expert, stages.deploy(run, offline.policy)))
+    expert, agent = (run.fresh(controller) for controller in (run.expert, run.deploy(offline.policy)))
     assert expert.n_trajectories == run.scale_params.evaluation
     assert torch.equal(expert.x[0], agent.x[0])
     assert torch.equal(expert.y[0], agent.y[0])
@@ -126,7 +126,7 @@ def test_every_controller_meets_the_same_disturbances(learned):
 
 def test_a_policy_comes_with_its_weights_also_from_another_case():
     run = session(case=3)
-    policy, weights = stages.load_policy(run, "offline_improved", "02_offline_irl", 1)
+    policy, weights = run.load_policy("offline_improved", "02_offline_irl", 1)
     assert isinstance(policy, LSTMPolicy)
     rows = pd.read_csv(run.folder(run.input_root, "offline_improved", 1) / "weights.csv").set_index("feature")["alpha"]
     assert weights.tolist() == [rows[name] for name in run.feature_names]
@@ -134,9 +134,9 @@ def test_a_policy_comes_with_its_weights_also_from_another_case():
 
 @pytest.mark.parametrize("verb", ["load_demonstrations", "load_policy"])
 def test_a_missing_upstream_result_names_file_and_notebook(tmp_path, verb):
-    action = partial(stages.load_policy, stage="offline_improved", made_by="02_offline_irl")
+    action = partial(Session.load_policy, stage="offline_improved", made_by="02_offline_irl")
     with pytest.raises(ArtifactError, match=r"record\.json: this result is missing; run 0[12]_[a-z_]* for case 1 first"):
-        {"load_demonstrations": stages.load_demonstrations, "load_policy": action}[verb](session(input_root=str(tmp_path)))
+        {"load_demonstrations": Session.load_demonstrations, "load_policy": action}[verb](session(input_root=str(tmp_path)))
 
 
 # Cost: never more than the paper -------------------------------------------------------------------------------------
@@ -184,6 +184,6 @@ def test_a_rerun_is_bit_equal(learned):
 def test_a_rerun_with_another_number_of_threads_is_bit_equal(learned):
     """Other processes, whatever their environment says: the scale sets the threads."""
     environment = os.environ | {"OMP_NUM_THREADS": "2", "MKL_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2", "TQDM_DISABLE": "1"}
-    command = [sys.executable, "-c", "from tests.runs import test_stages; print(test_stages.learn()[-1])"]
+    command = [sys.executable, "-c", "from tests.runs import test_study; print(test_study.learn()[-1])"]
     done = subprocess.run(command, cwd=PROJECT, env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == learned[-1]

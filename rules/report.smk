@@ -1,0 +1,41 @@
+# The report, and what it reads.
+
+# Of make bench, which may not have been run: what the report shows of it.
+BENCHMARKS = [ROOT / "reports/reference/benchmarks" / name for name in ("summary.md", "machine.md", "scaling.svg")]
+
+
+def read_of_seed(seed):
+    """Every result of a seed that the report reads, by place below its folder."""
+    stages = [f"case_{case}/{stage}" for case in CASES for stage in ("demonstrations", f"offline_{HEADLINE}", f"online_{HEADLINE}")]
+    stages += [f"case_{case}/offline_{variant}" for case in (1, 2) for variant in VARIANTS[1:]]
+    stages += [f"case_3/transfer_{variant}" for variant in VARIANTS]
+    if EVIDENCE:
+        stages += ["inferred_settings"] if seed == 0 else []
+        stages += [f"case_{case}/{stage}" for case in CASES for stage in ("experiments", *(["limits_safety"] if seed in FEW else []))]
+        for trial in TRIALS if seed in FEW else ():
+            stages += [f"case_1/offline_{trial}", f"case_2/offline_{trial}", f"case_3/transfer_{trial}"]
+    return stages
+
+
+def finished(wildcards):
+    """Every result that the report reads; those that are there, if some may be missing."""
+    stages = [record(stage, SEED.format(seed=seed)) for seed in SEEDS for stage in read_of_seed(seed)]
+    return [stage for stage in stages if Path(stage).is_file()] if MISSING else stages
+
+
+rule report:
+    input:
+        made_from("05_report", f"{REPORTS}/provenance.json"),
+        template=[str(path) for path in sorted((ROOT / "reports/template").iterdir())],
+        benchmarks=[str(path) for path in BENCHMARKS if path.is_file()],
+        stages=finished,
+    output:
+        f"{REPORTS}/report.html",
+        f"{REPORTS}/provenance.json",
+    log:
+        f"{REPORTS}/notebooks/05_report.ipynb",
+    params:
+        seeds=len(SEEDS),
+        missing=int(MISSING),
+    shell:
+        run("05_report", "seeds {params.seeds}", "missing {params.missing}", output_root=REPORTS)

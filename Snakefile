@@ -29,7 +29,7 @@ TRIALS = sorted(load_trials(ROOT / "params"))
 CASES = [1, 2, 3]
 # Of make bench, which may not have been run: what the report shows of it.
 BENCHMARKS = [ROOT / "reports/reference/benchmarks" / name for name in ("summary.md", "machine.md", "scaling.svg")]
-# Eleven trials of offline learning for every seed would be dear: five seeds must do there.
+# Ten trials of offline learning for every seed would be dear: five seeds must do there.
 FEW = SEEDS[:5]
 CASE = f"{RESULTS}/{SCALE}/seed_{{seed}}/case_{{case}}"
 LOG = f"{RESULTS}/{SCALE}/seed_{{seed}}/case_{{case}}/notebooks"

@@ -372,16 +372,6 @@ def test_an_entropy_bonus_keeps_exploration_up(study, settings, minibatches):
     assert spread(1.0) > spread(0.0) + 0.003
 
 
-@pytest.mark.torture
-def test_the_natural_gradient_raises_the_return_on_an_easy_task(study, settings):
-    """As the test of the variants above, in as many steps: the policy's distribution moves by the trust region in each."""
-    case = study(1, torch.float32)
-    changes = {"credit": "reward_to_go", "trust_region": 0.1, "learning_rate_start": 1.0, "learning_rate_end": 1.0}
-    learner = case.learner(case.policy(), 100, 25, settings(**changes))
-    returns = [record.mean_return for record in algorithm_1(learner, closeness_reward(case, 1.0), 25)]
-    assert np.mean(returns[-3:]) > returns[0] + 20
-
-
 def test_any_number_of_variables(synthetic, settings):
     for n_controlled, n_manipulated in ((1, 1), (3, 3), (3, 2)):
         case = synthetic(n_controlled, n_manipulated)

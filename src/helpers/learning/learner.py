@@ -1,8 +1,7 @@
 """What Algorithm 1 is made of: returns and advantages, surrogates of the policy gradient, and the learner that takes the steps.
 
 As printed: the whole return less its mean over the batch, and one plain step an epoch. Ours are reward-to-go with a regression
-baseline, clipped steps on minibatches, an entropy bonus, a step size that falls, a running average of the weights, and the natural
-gradient.
+baseline, clipped steps on minibatches, an entropy bonus, a step size that falls, and a running average of the weights.
 """
 
 import copy
@@ -16,7 +15,6 @@ from torch import Tensor
 from helpers.learning.evaluation import expected_features
 from helpers.learning.features import FeatureMap, accumulated_error, discounts, normalised_error
 from helpers.learning.lstm import Tape
-from helpers.learning.natural import precondition
 from helpers.learning.optimiser import Adam
 from helpers.learning.policy import LSTMPolicy, PolicyController, entropy, log_density
 from helpers.plant.process import Process
@@ -155,9 +153,7 @@ class Learner:
         self.n_episodes = n_episodes
         self.total_epochs = total_epochs
         self.generator = generator
-        # With the natural gradient, the learning rate is the share of the trust region that a step takes.
-        kind: type[Adam] | type[torch.optim.SGD] = Adam if params.trust_region is None else torch.optim.SGD
-        self.optimiser = kind(policy.parameters(), lr=params.learning_rate_start)
+        self.optimiser = Adam(policy.parameters(), lr=params.learning_rate_start)
         self.epochs = self.episodes = self.gradient_steps = 0
         self._tapes: list[Tape] = []
 
@@ -259,8 +255,6 @@ class Learner:
                     gain = gain + params.entropy * entropy(std, self.features.task).sum(0).mean()
                 (-gain * (rows.stop - rows.start) / (last - first)).backward()
             self._check_gradient()
-            if params.trust_region is not None:
-                precondition(self.policy, batch, self.features.task, params.trust_region)
             self.optimiser.step()
             self.gradient_steps += 1
 

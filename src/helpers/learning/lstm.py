@@ -5,7 +5,6 @@ time, and the gradient can start from what the rollout has computed already. Arr
 trajectories last, so that every gate is a contiguous block.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -146,12 +145,7 @@ def step(moment: Moment, weight: Tensor) -> Tensor:
 
 def stacked(layer: nn.LSTM) -> Tensor:
     """The layer's parameters as one matrix on [x, 1, h], shape (4 n, n_in + 1 + n); torch's gates i, f, g, o as i, f, o, g."""
-    return stack(layer.all_weights[0])
-
-
-def stack(parameters: Sequence[Tensor]) -> Tensor:
-    """`stacked` for the four parameters of a layer in torch's order, or for changes of them."""
-    from_below, from_before, bias_below, bias_before = parameters
+    from_below, from_before, bias_below, bias_before = layer.all_weights[0]
     matrix = torch.cat([from_below, (bias_below + bias_before)[:, None], from_before], dim=1)
     entry, forget, candidate, exit_ = matrix.chunk(4)
     return torch.cat([entry, forget, exit_, candidate])

@@ -67,10 +67,10 @@ def regression_advantage(rewards: Tensor, gamma: float, decay: float, regressors
         regressors: shape (T, K, p); row t was known before u_t was drawn. A constant is added here.
     """
     future = reward_to_go(rewards, gamma, decay)
-    design = torch.cat([torch.ones_like(regressors[..., :1]), regressors], dim=-1)
-    ridge = 1e-3 * rewards.shape[1] * torch.eye(design.shape[-1], dtype=design.dtype)
-    coefficients = torch.linalg.solve(design.mT @ design + ridge, design.mT @ future[..., None])
-    return future - (design @ coefficients)[..., 0]
+    design = torch.cat([torch.ones_like(future)[:, None], regressors.mT], dim=1)  # in memory the trajectories come last
+    ridge = 1e-3 * rewards.shape[1] * torch.eye(design.shape[1], dtype=design.dtype)
+    coefficients = torch.linalg.solve(design @ design.mT + ridge, design @ future[..., None])
+    return future - (coefficients.mT @ design)[:, 0]
 
 
 def baseline_regressors(trajectories: Trajectories, features: FeatureMap) -> Tensor:
@@ -82,7 +82,7 @@ def baseline_regressors(trajectories: Trajectories, features: FeatureMap) -> Ten
     error = normalised_error(trajectories.y[:-1], task.set_point, task.error_scale)
     integral = accumulated_error(error, features.sampling_time)
     previous = torch.cat([torch.zeros_like(trajectories.u[:1]), trajectories.u[:-1]]) / (task.input_high - task.input_low)
-    return torch.cat([error, error.abs(), error**2, integral, previous], dim=-1)
+    return torch.cat([entry.mT for entry in (error, error.abs(), error**2, integral, previous)], dim=1).mT
 
 
 def surrogate(log_probability: Tensor, advantage: Tensor) -> Tensor:
@@ -155,14 +155,14 @@ class Learner:
         self.generator = generator
         self.optimiser = Adam(policy.parameters(), lr=params.learning_rate_start)
         self.epochs = self.episodes = self.gradient_steps = 0
-        self._tapes: list[Tape] = []
+        self._tape: Tape | None = None
 
     def realise(self) -> Trajectories:
         """Step 1 of Algorithm 1: K episodes of T steps under the exploring policy."""
         task, recording = self.features.task, self.n_episodes <= BLOCK
-        controller = PolicyController(self.policy, task, exploring=True, recording=recording, used=self._tapes)
+        controller = PolicyController(self.policy, task, exploring=True, recording=recording, used=self._tape)
         batch = rollout(self.process, controller, task, self.n_episodes, self.generator)
-        self._tapes = controller.tapes
+        self._tape = controller.tape
         return batch
 
     def advantage(self, rewards: Tensor, batch: Trajectories) -> Tensor:
@@ -238,10 +238,10 @@ class Learner:
         drawn = None
         if n_steps > 1:
             with torch.no_grad():
-                drawn = log_density(batch.command, *self._distribution(batch, slice(0, self.n_episodes), bool(self._tapes)))
+                drawn = log_density(batch.command, *self._distribution(batch, slice(0, self.n_episodes), self._tape is not None))
         for step in range(n_steps):
             first, last = edges[step % params.minibatches], edges[step % params.minibatches + 1]
-            recorded = step == 0 and bool(self._tapes)  # later on the tapes are those of an older policy
+            recorded = step == 0 and self._tape is not None  # later on the tape is that of an older policy
             self.optimiser.zero_grad()
             for start in range(first, last, BLOCK):
                 rows = slice(start, min(start + BLOCK, last))
@@ -262,8 +262,8 @@ class Learner:
         """Mean and standard deviation of the present policy along some episodes."""
         if not recorded and rows.stop - rows.start < FEW:
             return self.policy(batch.y[:, rows], batch.u[:, rows], self.features.task)
-        tapes = [tape.part(rows) for tape in self._tapes]
-        return self.policy.unrolled(batch.y[:, rows], batch.u[:, rows], self.features.task, tapes, recorded)
+        tape = self._tape and self._tape.part(rows.start, rows.stop)
+        return self.policy.unrolled(batch.y[:, rows], batch.u[:, rows], self.features.task, tape, recorded)
 
     def _check_gradient(self) -> None:
         rate = self.optimiser.param_groups[0]["lr"]

@@ -1,14 +1,13 @@
 """The LSTM policy of Section 3.2: its distribution over the inputs, and its fast stepping in closed loop."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from helpers.learning.lstm import Tape, Unroll, stacked, step
+from helpers.learning.lstm import Tape, Unroll, for_steps, stacked, step
 from helpers.plant.task import ControlTask
 from helpers.settings.paper import ExplorationParams, PolicyParams
 
@@ -137,23 +136,19 @@ class LSTMPolicy(nn.Module):
         return self.scale(self.output(signal), task)
 
     def unrolled(
-        self, y: Tensor, u: Tensor, task: ControlTask, tapes: Sequence[Tape] = (), recorded: bool = False
+        self, y: Tensor, u: Tensor, task: ControlTask, tape: Tape | None = None, recorded: bool = False
     ) -> tuple[Tensor, Tensor]:
         """What `forward` gives, faster.
 
-        Tapes of these trajectories lend their memory. With `recorded` they hold what a controller with these parameters computed
+        A tape of these trajectories lends its memory. With `recorded` it holds what a controller with these parameters computed
         along the trajectories, and that is not computed again.
         """
         weights = [stacked(layer) for layer in self.lstms]
-        if recorded:
-            signal = tapes[0].inputs
-        else:
+        if tape is None or not recorded:
             previous = torch.cat([torch.zeros_like(u[:1]), u[:-1]])
-            signal = self.network_inputs(y[: len(u)], previous, task).mT
-            lent: Sequence[Tape | None] = tapes or [None] * len(weights)
-            tapes = [Tape.blank(len(u), weight.detach(), u.shape[1], old) for weight, old in zip(weights, lent, strict=True)]
-        for weight, tape in zip(weights, tapes, strict=True):
-            signal = functional.leaky_relu(Unroll.apply(signal, weight, tape, recorded), self.params.leaky_slope)
+            tape = Tape.blank(weights, u.shape[1], len(u), tape)
+            tape.layers[0].inputs[:-1] = self.network_inputs(y[: len(u)], previous, task).mT
+        signal = Unroll.apply(tape, recorded, self.params.leaky_slope, *weights)
         # A batch of products: `@` would copy the signal of all steps to make one product of them.
         output = torch.baddbmm(self.output.bias[:, None], self.output.weight.expand(len(signal), -1, -1), signal)
         return self.scale(output.mT, task)
@@ -171,7 +166,7 @@ class PolicyMemory:
     """What every layer computed so far, and the exploration noise of every step; features first."""
 
     step: int
-    tapes: list[Tape]
+    tape: Tape
     seen: Tensor  # the present observation above the input before it, shape (n_y + n_u, K)
     observed: Tensor  # the two parts of `seen`
     applied: Tensor
@@ -182,46 +177,40 @@ class PolicyController:
     """A policy in closed loop: the same mathematics as `LSTMPolicy.forward`, one step at a time, without gradients.
 
     `exploring` draws from the distribution; without it the mode is used, as on deployment. `recording` keeps what the
-    layers computed in `tapes`, for the gradient, writing over used tapes where there are any. The parameters are those of
+    layers computed in `tape`, for the gradient, writing over a used tape where there is one. The parameters are those of
     the policy when the controller was made.
     """
 
     def __init__(
-        self, policy: LSTMPolicy, task: ControlTask, exploring: bool, recording: bool = False, used: Sequence[Tape] = ()
+        self, policy: LSTMPolicy, task: ControlTask, exploring: bool, recording: bool = False, used: Tape | None = None
     ) -> None:
         self.policy = policy
         self.task = task
         self.exploring = exploring
         self.recording = recording
         with torch.no_grad():
-            self.layers = [stacked(layer) for layer in policy.lstms]
+            self.layers = [for_steps(stacked(layer)) for layer in policy.lstms]
             self.output_weight, self.output_bias = policy.output.weight.clone(), policy.output.bias[:, None].clone()
-        self.tapes = list(used)
+        self.tape = used
         self.scaling = policy.scaling(task).features_first()
         self.low, self.high = task.input_low[:, None], task.input_high[:, None]
 
     def start(self, n_trajectories: int, n_steps: int, generator: torch.Generator) -> PolicyMemory:
         """Zero hidden states, the input at u* = 0, and all exploration noise drawn at once."""
         like, n_inputs = self.output_weight, self.policy.n_manipulated
-        used: Sequence[Tape | None] = self.tapes or [None] * len(self.layers)
-        length = n_steps if self.recording else 1
-        tapes = [Tape.blank(length, weight, n_trajectories, old) for weight, old in zip(self.layers, used, strict=True)]
-        self.tapes = tapes if self.recording else []
+        tape = Tape.blank(self.layers, n_trajectories, n_steps if self.recording else None, self.tape)
+        self.tape = tape if self.recording else None
         shape = (n_steps, n_inputs, n_trajectories)
         noise = torch.randn(shape, generator=generator, dtype=like.dtype).unbind(0) if self.exploring else ()
         seen = like.new_zeros(len(self.scaling.centre), n_trajectories)
-        return PolicyMemory(0, tapes, seen, seen[:-n_inputs], seen[-n_inputs:], noise)
+        return PolicyMemory(0, tape, seen, seen[:-n_inputs], seen[-n_inputs:], noise)
 
     def act(self, observation: Tensor, memory: PolicyMemory) -> tuple[Tensor, PolicyMemory]:
         """The policy's command for one sample; the memory is updated in place."""
         memory.observed.copy_(observation.T)
-        moments = [tape.at(memory.step) for tape in memory.tapes]
+        moments = memory.tape.at(memory.step)
         torch.sub(memory.seen, self.scaling.centre, out=moments[0].inputs).mul_(self.scaling.gain)
-        for layer, (moment, weight) in enumerate(zip(moments, self.layers, strict=True)):
-            signal = functional.leaky_relu(step(moment, weight), self.policy.params.leaky_slope)
-            if layer + 1 < len(moments):
-                moments[layer + 1].inputs.copy_(signal)
-        output = torch.addmm(self.output_bias, self.output_weight, signal)
+        output = torch.addmm(self.output_bias, self.output_weight, step(moments, self.layers, self.policy.params.leaky_slope))
         mean, std = torch.addcmul(self.scaling.shift, functional.relu6(output), self.scaling.factor).chunk(2)
         command = torch.addcmul(mean, std, memory.exploration[memory.step]) if memory.exploration else mean
         torch.clamp(command, self.low, self.high, out=memory.applied)

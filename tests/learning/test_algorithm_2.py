@@ -151,7 +151,7 @@ def setting(case, n_episodes=6, total_epochs=6, seed=0, **changes):
     """A learner, the expert's features and the first weights."""
     params = case.params.learning.variants["printed"].learner.model_copy(update={"patience": 0, **changes})
     learner = case.learner(case.policy(seed), n_episodes, total_epochs, params, seed)
-    expert = expected_features(case.process, case.pid, case.features, 20, stream(seed, "expert")).mean
+    expert = expected_features(case.process, case.pid, case.features, 20, stream(seed, "expert"))
     return learner, expert, project(normal(len(expert)))
 
 
@@ -189,7 +189,7 @@ def measured_after(case, record):
     assert learner.total_epochs == 2 * record.epochs
     algorithm_1(learner, lambda batch: linear_reward(case.features.state(batch), start), 1)
     controller = PolicyController(learner.policy, case.task, exploring=False)
-    found = expected_features(case.process, controller, case.features, 5, learner.generator).mean
+    found = expected_features(case.process, controller, case.features, 5, learner.generator)
     gap = ((found - expert).abs() / expert.abs()).mean().item()
     assert record.feature_gap == pytest.approx(gap, rel=1e-10)
     return found
@@ -242,7 +242,7 @@ def test_features_come_nearer_the_experts(study, weights_of):
     """A short run of the improved variant on Case Study I, from a policy that leaves the inputs near zero."""
     case = study(1, torch.float32)
     variant = case.params.learning.variants["improved"]
-    expert = expected_features(case.process, case.pid, case.features, 200, stream(0, "expert")).mean
+    expert = expected_features(case.process, case.pid, case.features, 200, stream(0, "expert"))
     learner = case.learner(case.policy(), 100, 40, variant.learner)
     start = initial_weights(variant.weights, 2, torch.float32)
     gaps = [record.feature_gap for record in algorithm_2(learner, expert, start, variant.weights, 40, 50).records]

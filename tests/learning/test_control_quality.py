@@ -9,12 +9,11 @@ from helpers.learning.control_quality import (
     harris_index,
     input_figures,
     integral_errors,
-    overshoot,
     quality,
-    rise_time,
     settling_time,
     worst_mean,
 )
+from helpers.learning.evaluation import overshoot, rise_time
 from helpers.plant.rollout import rollout, stream
 from helpers.plant.task import Trajectories
 from helpers.settings.limits import load_limits
@@ -30,10 +29,10 @@ def test_step_response_figures_are_those_of_python_control(frequency, damping, b
     system = control.tf([frequency**2], [1, 2 * damping * frequency, frequency**2])
     _, y = control.step_response(system, TIME)
     expected = control.step_info(y, TIME, yfinal=1.0, SettlingTimeThreshold=band)
-    response = torch.from_numpy(y.copy())[:, None]
-    assert overshoot(response).item() == pytest.approx(expected["Overshoot"] / 100, abs=1e-12)
-    assert rise_time(response, DT).item() == pytest.approx(expected["RiseTime"], abs=1e-9)
-    assert settling_time(response, DT, band).item() == pytest.approx(expected["SettlingTime"], abs=1e-9)
+    error = 1 - torch.from_numpy(y.copy())[:, None]
+    assert overshoot(error).item() == pytest.approx(expected["Overshoot"] / 100, abs=1e-12)
+    assert rise_time(error, DT).item() == pytest.approx(expected["RiseTime"], abs=1e-9)
+    assert settling_time(error, DT, band).item() == pytest.approx(expected["SettlingTime"], abs=1e-9)
 
 
 def test_noise_free_responses_of_the_pid_agree_with_python_control(study, root):
@@ -59,10 +58,10 @@ def test_noise_free_responses_of_the_pid_agree_with_python_control(study, root):
 
 
 def test_what_is_never_reached_is_undefined():
-    response = torch.tensor([[0.0, 0.0], [0.5, 0.95], [0.8, 1.2]])
-    assert rise_time(response, DT).isnan().tolist() == [True, False]
-    assert settling_time(response, DT, 0.05).isnan().all()
-    assert overshoot(response).tolist() == [0.0, pytest.approx(0.2)]
+    error = 1 - torch.tensor([[0.0, 0.0], [0.5, 0.95], [0.8, 1.2]])
+    assert rise_time(error, DT).isnan().tolist() == [True, False]
+    assert settling_time(error, DT, 0.05).isnan().all()
+    assert overshoot(error).tolist() == [0.0, pytest.approx(0.2)]
 
 
 def test_integral_errors_by_hand():

@@ -62,7 +62,7 @@ def test_the_output_layer_is_relu6_mapped_to_the_bounds(study):
     case = study()
     policy, task = case.policy(std_low=0.1, initial_std=0.2, std_high=0.7), case.task
     z = torch.linspace(-4, 10, 57, dtype=F64)[:, None].repeat(1, 4)
-    mean, std = (part.detach().numpy() for part in policy.scale(z, task))
+    mean, std = (part.detach().numpy() for part in policy.scaling(task).outputs(z))
     relu6 = np.minimum(np.maximum(0, z.numpy()), 6)[:, :2]
     low, span = task.input_low.numpy(), (task.input_high - task.input_low).numpy()
     np.testing.assert_allclose(mean, low + span * relu6 / 6, rtol=1e-13, atol=1e-13)

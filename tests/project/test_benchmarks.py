@@ -166,7 +166,7 @@ def test_the_environment_is_the_process_with_its_reward(workload, signal):
     x, y, u = (torch.tensor(np.array(values))[:, None] for values in (xs, ys, us))
     np.testing.assert_allclose(rewards, reward(Trajectories(x, y, u, u))[:, 0], rtol=1e-10)
     previous = torch.cat([torch.zeros_like(u[:1]), u])
-    np.testing.assert_allclose(np.array(views), policy.network_inputs(y, previous, features.task)[:, 0], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(np.array(views), policy.scaling(features.task).inputs(y, previous)[:, 0], rtol=1e-5, atol=1e-6)
 
 
 @LIBRARY

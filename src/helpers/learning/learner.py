@@ -6,7 +6,6 @@ baseline, clipped steps on minibatches, an entropy bonus, a step size that falls
 
 import copy
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -24,7 +23,6 @@ from helpers.settings.paper import LearnerParams
 
 BLOCK = 1000  # episodes whose gradient is computed at once: more would only take memory
 FEW = 100  # episodes below which torch's own LSTM is faster than the gradient through time written out: 7 against 17 ms for 50
-Reward = Callable[[Trajectories], Tensor]  # rewards R_1..R_T, shape (T, K)
 
 
 class TrainingError(RuntimeError):
@@ -132,6 +130,7 @@ class Learner:
         policy: the policy that explores and takes the gradient steps.
         average: the exponential average of its weights, which is what is kept in the end. With an averaging coefficient
             of zero it equals the policy.
+        rate: the present learning rate.
         epochs, episodes, gradient_steps: counted up as they are spent.
     """
 
@@ -153,7 +152,7 @@ class Learner:
         self.n_episodes = n_episodes
         self.total_epochs = total_epochs
         self.generator = generator
-        self.optimiser = Adam(policy.parameters(), lr=params.learning_rate_start)
+        self.optimiser, self.rate = Adam(policy.parameters()), params.learning_rate_start
         self.epochs = self.episodes = self.gradient_steps = 0
         self._tape: Tape | None = None
 
@@ -190,25 +189,29 @@ class Learner:
             TrainingError: if the gradient is not finite.
         """
         params = self.params
-        rate = annealed(params.learning_rate_start, params.learning_rate_end, self.epochs / max(1, self.total_epochs - 1))
-        for group in self.optimiser.param_groups:
-            group["lr"] = rate
+        self.rate = annealed(params.learning_rate_start, params.learning_rate_end, self.epochs / max(1, self.total_epochs - 1))
         self._ascend(batch, advantage)
         self.epochs += 1
         self.episodes += self.n_episodes
-        self._update_average()
+        # The warm-up keeps the untrained first weights from lingering in the average.
+        keep = min(params.averaging, self.epochs / (self.epochs + 9)) if params.averaging else 0.0
+        with torch.no_grad():
+            for average, current in zip(self.average.parameters(), self.policy.parameters(), strict=True):
+                average.lerp_(current, 1 - keep)
 
     def record(self, rewards: Tensor, batch: Trajectories) -> EpochRecord:
-        """What the epoch that has just ended gave."""
-        returns = discounted_return(rewards, self.features.params.discount)
+        """What the epoch that has just ended gave; how far the policy explores is read off one trajectory."""
+        returns, task = discounted_return(rewards, self.features.params.discount), self.features.task
+        with torch.no_grad():
+            std = self.policy(batch.y[:, :1], batch.u[:, :1], task)[1]
         return EpochRecord(
             self.epochs,
             self.episodes,
             self.gradient_steps,
             returns.mean().item(),
             returns.std().item() / self.n_episodes**0.5,
-            self.optimiser.param_groups[0]["lr"],
-            self._exploration(batch),
+            self.rate,
+            (std / (task.input_high - task.input_low)).mean().item(),
         )
 
     def expected_features(self, n_episodes: int) -> Tensor:
@@ -220,7 +223,7 @@ class Learner:
             TrainingError: if the features are not finite.
         """
         mode = PolicyController(self.policy, self.features.task, exploring=False)
-        v = expected_features(self.process, mode, self.features, n_episodes, self.generator).mean
+        v = expected_features(self.process, mode, self.features, n_episodes, self.generator)
         self.episodes += n_episodes
         if not torch.isfinite(v).all():
             raise TrainingError(f"epoch {self.epochs}: the trajectory features of the policy are not finite")
@@ -242,7 +245,7 @@ class Learner:
         for step in range(n_steps):
             first, last = edges[step % params.minibatches], edges[step % params.minibatches + 1]
             recorded = step == 0 and self._tape is not None  # later on the tape is that of an older policy
-            self.optimiser.zero_grad()
+            self.policy.zero_grad()
             for start in range(first, last, BLOCK):
                 rows = slice(start, min(start + BLOCK, last))
                 mean, std = self._distribution(batch, rows, recorded)
@@ -254,8 +257,11 @@ class Learner:
                 if params.entropy:
                     gain = gain + params.entropy * entropy(std, self.features.task).sum(0).mean()
                 (-gain * (rows.stop - rows.start) / (last - first)).backward()
-            self._check_gradient()
-            self.optimiser.step()
+            for name, parameter in self.policy.named_parameters():
+                if parameter.grad is not None and not parameter.grad.isfinite().all():
+                    cause = f"the gradient of {name} is not finite at the learning rate {self.rate:g}"
+                    raise TrainingError(f"epoch {self.epochs + 1}: {cause}")
+            self.optimiser.step(self.rate)
             self.gradient_steps += 1
 
     def _distribution(self, batch: Trajectories, rows: slice, recorded: bool) -> tuple[Tensor, Tensor]:
@@ -264,23 +270,3 @@ class Learner:
             return self.policy(batch.y[:, rows], batch.u[:, rows], self.features.task)
         tape = self._tape and self._tape.part(rows.start, rows.stop)
         return self.policy.unrolled(batch.y[:, rows], batch.u[:, rows], self.features.task, tape, recorded)
-
-    def _check_gradient(self) -> None:
-        rate = self.optimiser.param_groups[0]["lr"]
-        for name, parameter in self.policy.named_parameters():
-            if parameter.grad is not None and not parameter.grad.isfinite().all():
-                raise TrainingError(f"epoch {self.epochs + 1}: the gradient of {name} is not finite at the learning rate {rate:g}")
-
-    def _exploration(self, batch: Trajectories) -> float:
-        """Standard deviation of the policy as a share of the input range, along one trajectory."""
-        task = self.features.task
-        with torch.no_grad():
-            std = self.policy(batch.y[:, :1], batch.u[:, :1], task)[1]
-        return (std / (task.input_high - task.input_low)).mean().item()
-
-    def _update_average(self) -> None:
-        # The warm-up keeps the untrained first weights from lingering in the average.
-        keep = min(self.params.averaging, self.epochs / (self.epochs + 9)) if self.params.averaging else 0.0
-        with torch.no_grad():
-            for average, current in zip(self.average.parameters(), self.policy.parameters(), strict=True):
-                average.lerp_(current, 1 - keep)

@@ -81,13 +81,11 @@ class LSTMPolicy(nn.Module):
         """A fresh policy whose mean input is near u* = 0 and whose standard deviation is the initial one."""
         policy = cls(params, len(task.set_point), len(task.input_low)).to(task.set_point.dtype)
         with torch.no_grad():
-            for layer in policy.lstms:
-                bound = 1 / math.sqrt(layer.hidden_size)
-                for parameter in layer.parameters():
-                    parameter.copy_(torch.rand(parameter.shape, generator=generator, dtype=parameter.dtype) * 2 * bound - bound)
-            weight = policy.output.weight
-            bound = params.initial_output_scale / math.sqrt(weight.shape[1])
-            weight.copy_(torch.rand(weight.shape, generator=generator, dtype=weight.dtype) * 2 * bound - bound)
+            layers = [(layer, 1 / math.sqrt(layer.hidden_size)) for layer in policy.lstms]
+            bounds = [(parameter, bound) for layer, bound in layers for parameter in layer.parameters()]
+            top = params.initial_output_scale / math.sqrt(policy.output.in_features)
+            for parameter, bound in [*bounds, (policy.output.weight, top)]:
+                parameter.copy_(torch.rand(parameter.shape, generator=generator, dtype=parameter.dtype) * 2 * bound - bound)
             policy.output.bias[: policy.n_manipulated] = -RELU6_TOP * task.input_low / (task.input_high - task.input_low)
         policy.reset_exploration()
         return policy
@@ -114,26 +112,21 @@ class LSTMPolicy(nn.Module):
             factor=torch.cat([span, (params.std_high - params.std_low) * span]) / RELU6_TOP,
         )
 
-    def network_inputs(self, y: Tensor, u_previous: Tensor, task: ControlTask) -> Tensor:
-        """What the network sees, shape (..., n_y + n_u), from observations and the inputs applied one sample before."""
-        return self.scaling(task).inputs(y, u_previous)
-
-    def scale(self, output: Tensor, task: ControlTask) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the inputs, each (..., n_u), from the output layer before its activation."""
-        return self.scaling(task).outputs(output)
+    def network_inputs(self, y: Tensor, u: Tensor, task: ControlTask) -> Tensor:
+        """What the network sees along trajectories as of `forward`, shape (T, K, n_y + n_u); at first the input is u* = 0."""
+        return self.scaling(task).inputs(y[: len(u)], torch.cat([torch.zeros_like(u[:1]), u[:-1]]))
 
     def forward(self, y: Tensor, u: Tensor, task: ControlTask) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of u_0..u_{T-1} along recorded trajectories, each (T, K, n_u).
 
         Args:
             y: observations y_0..y_{T-1} (a y_T is ignored), shape (T or T + 1, K, n_y).
-            u: applied inputs u_0..u_{T-1}, shape (T, K, n_u). Before the first sample the input is u* = 0.
+            u: applied inputs u_0..u_{T-1}, shape (T, K, n_u).
         """
-        previous = torch.cat([torch.zeros_like(u[:1]), u[:-1]])
-        signal = self.network_inputs(y[: len(u)], previous, task)
+        signal = self.network_inputs(y, u, task)
         for layer in self.lstms:
             signal = functional.leaky_relu(layer(signal)[0], self.params.leaky_slope)
-        return self.scale(self.output(signal), task)
+        return self.scaling(task).outputs(self.output(signal))
 
     def unrolled(
         self, y: Tensor, u: Tensor, task: ControlTask, tape: Tape | None = None, recorded: bool = False
@@ -145,13 +138,12 @@ class LSTMPolicy(nn.Module):
         """
         weights = [stacked(layer) for layer in self.lstms]
         if tape is None or not recorded:
-            previous = torch.cat([torch.zeros_like(u[:1]), u[:-1]])
             tape = Tape.blank(weights, u.shape[1], len(u), tape)
-            tape.layers[0].inputs[:-1] = self.network_inputs(y[: len(u)], previous, task).mT
+            tape.layers[0].inputs[:-1] = self.network_inputs(y, u, task).mT
         signal = Unroll.apply(tape, recorded, self.params.leaky_slope, *weights)
         # A batch of products: `@` would copy the signal of all steps to make one product of them.
         output = torch.baddbmm(self.output.bias[:, None], self.output.weight.expand(len(signal), -1, -1), signal)
-        return self.scale(output.mT, task)
+        return self.scaling(task).outputs(output.mT)
 
     def log_probability(self, y: Tensor, u: Tensor, command: Tensor, task: ControlTask) -> Tensor:
         """ln pi(command_t | y_0..y_t, u_0..u_{t-1}), shape (T, K): the term of Eq. 3.2.3.

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
+import psutil
 import torch
 from matplotlib import pyplot as plt
 
@@ -20,6 +21,7 @@ from benchmarks.subjects import (
     Workload,
     comparison,
     flops_of_a_learnt_step,
+    installed,
     library_installed,
     scaling,
     scaling_sizes,
@@ -79,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns the exit status."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.benchmark",
-        description="Time the learning epoch against the machine's bound, the same one episode at a time, and RecurrentPPO.",
+        description="Time the learning epoch against the machine's bound, one episode at a time, JAX, and RecurrentPPO.",
     )
     parser.add_argument("--quick", action="store_true", help="tiny sizes, to see that it runs; the numbers mean nothing")
     parser.add_argument("--whole", action="store_true", help="also run one seed of all cases (minutes) and time its stages")
@@ -93,10 +95,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     given = parser.parse_args(arguments)
     size = QUICK if given.quick else FULL
-    load, revision = {"at the start": outcome.load_average()}, code_revision(PROJECT)  # before what is written here changes it
+    load, revision = {"at the start": psutil.getloadavg()}, code_revision(PROJECT)  # before what is written here changes it
     workload = Workload.of()
     if not library_installed():
         say("stable-baselines3 and sb3-contrib are not installed (the extra 'bench'): RecurrentPPO is left out")
+    if not installed("jax"):
+        say("jax is not installed (the extra 'bench'): the epoch in JAX is left out")
     say(f"comparison at K = {size.K}, T = {size.T}")
     timings = in_rounds(comparison(workload, size), size.rounds)
     say("scaling in K and T")
@@ -108,7 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         say("the whole run of one seed")
         run = whole_run.whole_run("smoke" if given.quick else "paper", given.cores)
         stages = pd.concat([run, whole_run.fixed_costs(3)], ignore_index=True)
-    load["at the end"] = outcome.load_average()
+    load["at the end"] = psutil.getloadavg()
 
     both = outcome.table(timings | scaling_timings, memory)
     compared, scaled = both.iloc[: len(timings)], both.iloc[len(timings) :]

@@ -12,12 +12,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from helpers.learning.algorithm_1 import Reward
-from helpers.learning.features import FeatureMap
-from helpers.learning.learner import baseline_regressors, regression_advantage, surrogate, whole_return_advantage
+from helpers.learning.learner import Learner, surrogate
 from helpers.learning.policy import RELU6_TOP, LSTMPolicy
-from helpers.plant.process import LinearProcess
+from helpers.plant.process import Process
 from helpers.plant.task import ControlTask, Trajectories
-from helpers.settings.paper import LearnerParams
 
 
 class StepwisePolicy(nn.Module):
@@ -51,7 +49,7 @@ class StepwisePolicy(nn.Module):
         return task.input_low + span * mean, (params.std_low + (params.std_high - params.std_low) * deviation) * span, following
 
 
-def episode(policy: StepwisePolicy, process: LinearProcess, generator: torch.Generator) -> tuple[Trajectories, Tensor]:
+def episode(policy: StepwisePolicy, process: Process, generator: torch.Generator) -> tuple[Trajectories, Tensor]:
     """One episode, step by step: its record with K = 1 and ln pi of its commands, shape (T, 1), ready for autograd."""
     task = policy.task
     dtype = task.set_point.dtype
@@ -80,42 +78,23 @@ def episode(policy: StepwisePolicy, process: LinearProcess, generator: torch.Gen
     return record, torch.stack(log_probabilities)
 
 
-def weighed(batch: Trajectories, reward: Reward, features: FeatureMap, params: LearnerParams) -> Tensor:
-    """The advantage of every step of a batch as the project's learner computes it, shape (T, K)."""
-    rewards, gamma = reward(batch), features.params.discount
-    if params.credit == "whole_return":
-        advantage = whole_return_advantage(rewards, gamma)
-    else:
-        advantage = regression_advantage(rewards, gamma, params.credit_decay, baseline_regressors(batch, features))
-    return advantage / advantage.std()
-
-
 class OneAtATime:
-    """A learner that draws its episodes one after the other; its attributes are those of `helpers.learning.learner.Learner`."""
+    """A learner that draws its episodes one after the other; all else is as in the project's `learner`, which stays as it is."""
 
-    def __init__(
-        self,
-        policy: LSTMPolicy,
-        process: LinearProcess,
-        features: FeatureMap,
-        params: LearnerParams,
-        n_episodes: int,
-        generator: torch.Generator,
-    ) -> None:
-        """Starts from a copy of `policy`."""
-        self.policy = StepwisePolicy(policy, features.task)
-        self.process, self.features, self.params = process, features, params
-        self.n_episodes, self.generator = n_episodes, generator
-        self.optimiser = torch.optim.Adam(self.policy.parameters(), lr=params.learning_rate_start)
+    def __init__(self, learner: Learner) -> None:
+        """Starts from a copy of the learner's policy."""
+        self.learner = learner
+        self.policy = StepwisePolicy(learner.policy, learner.features.task)
+        self.optimiser = torch.optim.Adam(self.policy.parameters(), lr=learner.params.learning_rate_start)
 
     def gain(self, reward: Reward) -> tuple[Tensor, Trajectories]:
         """The surrogate of the policy gradient, Eq. 3.2.4, from fresh episodes, and their record."""
-        episodes = [episode(self.policy, self.process, self.generator) for _ in range(self.n_episodes)]
-        records = [record for record, _ in episodes]
-        names = ("x", "y", "u", "command")
-        batch = Trajectories(**{name: torch.cat([getattr(record, name) for record in records], dim=1) for name in names})
+        learner = self.learner
+        episodes = [episode(self.policy, learner.process, learner.generator) for _ in range(learner.n_episodes)]
+        signals = ([getattr(record, name) for record, _ in episodes] for name in ("x", "y", "u", "command"))
+        batch = Trajectories(*(torch.cat(signal, dim=1) for signal in signals))
         log_probability = torch.cat([each for _, each in episodes], dim=1)
-        return surrogate(log_probability, weighed(batch, reward, self.features, self.params)), batch
+        return surrogate(log_probability, learner.advantage(reward(batch), batch)), batch
 
     def epoch(self, reward: Reward) -> None:
         """Episodes, gradient, Adam step."""

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import psutil
 import torch
 from matplotlib import pyplot as plt
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from benchmarks.subjects import (
     BOUND,
-    FORWARD_PASSES,
     GATES,
+    JAX,
     LIBRARY,
     LIBRARY_SIZES,
     ONE_AT_A_TIME,
@@ -44,9 +44,8 @@ COLUMNS = [
     "rounds",
     "peak_mb",
 ]
-EXTRA = ("gymnasium", "stable_baselines3", "sb3_contrib")
-COLOURS = {1: "#d7191c", 2: "#1f4fd8"}
-MARKERS = {1: "o", 2: "s"}
+EXTRA = ("gymnasium", "stable_baselines3", "sb3_contrib", "jax", "jaxlib")
+COLOURS = ("#d7191c", MUTED)  # of time and memory
 
 
 def fitted_exponent(sizes: Sequence[float], values: Sequence[float]) -> tuple[float, float]:
@@ -84,13 +83,9 @@ def exponents(scaling: pd.DataFrame, K: int, T: int) -> pd.DataFrame:
     """Fitted exponents of time and memory in K (at this T) and in T (at this K), a row for each line of the figure."""
     rows = []
     for variable, fixed in (("K", scaling["T"] == T), ("T", scaling["K"] == K)):
-        for threads, group in scaling[fixed].groupby("threads"):
-            ordered = group.sort_values(variable)
-            rows.append({"quantity": "seconds", "against": variable, "threads": threads})
-            rows[-1]["exponent"], rows[-1]["factor"] = fitted_exponent(ordered[variable], ordered["seconds"])
-        ordered = scaling[fixed].drop_duplicates(variable)
-        rows.append({"quantity": "peak_mb", "against": variable, "threads": 1})
-        rows[-1]["exponent"], rows[-1]["factor"] = fitted_exponent(ordered[variable], ordered["peak_mb"])
+        for quantity in ("seconds", "peak_mb"):
+            exponent, factor = fitted_exponent(scaling.loc[fixed, variable], scaling.loc[fixed, quantity])
+            rows.append({"quantity": quantity, "against": variable, "exponent": exponent, "factor": factor})
     return pd.DataFrame(rows)
 
 
@@ -98,16 +93,19 @@ def scaling_figure(scaling: pd.DataFrame, fits: pd.DataFrame, K: int, T: int) ->
     """Seconds per epoch and peak memory against K and against T, log-log; the legend states the slopes."""
     figure, grid = plt.subplots(2, 2, figsize=(WIDTH, 6.2), sharex="col", sharey="row", layout="constrained")
     labels = {"K": f"episodes per epoch K (T = {T} steps each)", "T": f"steps per episode T (K = {K} episodes)"}
+    slopes = fits.set_index(["quantity", "against"])
     for column, variable in enumerate("KT"):
-        rows = scaling[scaling["T"] == T] if variable == "K" else scaling[scaling["K"] == K]
-        for threads, group in rows.groupby("threads"):
-            ordered = group.sort_values(variable)
-            line(grid[0, column], ordered, variable, "seconds", fits, threads)
-            spread = ordered[["seconds_min", "seconds_max"]]
-            grid[0, column].vlines(ordered[variable], *spread.to_numpy().T, color=COLOURS[threads], linewidth=0.8, alpha=0.6)
-        line(grid[1, column], rows.drop_duplicates(variable).sort_values(variable), variable, "peak_mb", fits, 1)
+        rows = (scaling[scaling["T"] == T] if variable == "K" else scaling[scaling["K"] == K]).sort_values(variable)
+        for axis, quantity, colour in zip(grid[:, column], ("seconds", "peak_mb"), COLOURS, strict=True):
+            slope, factor = slopes.loc[(quantity, variable)]
+            axis.plot(rows[variable], rows[quantity], "o", color=colour, label=f"slope {slope:.2f}")
+            axis.plot(rows[variable], factor * rows[variable] ** slope, "-", color=colour, linewidth=1.0)
+            axis.set(xscale="log", yscale="log")
+            axis.legend(frameon=False, loc="upper left")
+        spread = rows[["seconds_min", "seconds_max"]].to_numpy().T
+        grid[0, column].vlines(rows[variable], *spread, color=COLOURS[0], linewidth=0.8, alpha=0.6)
+        ticks = rows[variable].tolist()
         grid[1, column].set_xlabel(labels[variable])
-        ticks = sorted(rows[variable].unique())
         grid[1, column].set_xticks(ticks, [f"{tick:,}" for tick in ticks], minor=False)
         grid[1, column].minorticks_off()
     grid[0, 0].set_ylabel("time of an epoch (s)")
@@ -116,25 +114,6 @@ def scaling_figure(scaling: pd.DataFrame, fits: pd.DataFrame, K: int, T: int) ->
         "Cost of a learning epoch: medians, ranges over the rounds, and power laws fitted to the medians", color=INK, fontsize=10.5
     )
     return figure
-
-
-def line(axis: Axes, rows: pd.DataFrame, variable: str, quantity: str, fits: pd.DataFrame, threads: int) -> Axes:
-    """Points of one quantity and the power law fitted to them."""
-    fit = fits[(fits["quantity"] == quantity) & (fits["against"] == variable) & (fits["threads"] == threads)].iloc[0]
-    colour = COLOURS[threads] if quantity == "seconds" else MUTED
-    name = f"{threads} thread{'s' if threads > 1 else ''}, slope {fit['exponent']:.2f}"
-    axis.plot(
-        rows[variable],
-        rows[quantity],
-        MARKERS[threads],
-        color=colour,
-        label=name if quantity == "seconds" else f"slope {fit['exponent']:.2f}",
-    )
-    axis.plot(rows[variable], fit["factor"] * rows[variable] ** fit["exponent"], "-", color=colour, linewidth=1.0)
-    axis.set_xscale("log")
-    axis.set_yscale("log")
-    axis.legend(frameon=False, loc="upper left")
-    return axis
 
 
 def summary(
@@ -149,7 +128,7 @@ def summary(
 
     Args:
         flops: floating-point operations of one learnt step.
-        load: load average of the machine at the start, nan where unknown.
+        load: load average of the machine at the start.
     """
     columns = ["what", "threads", "steps_per_s"]
     rate = {(what, threads): value for what, threads, value in compared[columns].itertuples(index=False)}
@@ -157,7 +136,7 @@ def summary(
     threads = 1 if rate[OURS, 1] >= rate[OURS, 2] else 2
     K, T = compared.loc[compared["what"] == OURS, ["K", "T"]].iloc[0]
     others = [LIBRARY.format(environments=environments, passes=passes) for environments, passes in LIBRARY_SIZES]
-    against = {what: best[what] for what in (ONE_AT_A_TIME, *others, BOUND) if what in best}
+    against = {what: best[what] for what in (ONE_AT_A_TIME, JAX, *others, BOUND) if what in best}
     against["products and gate functions, one after the other"] = 1 / (1 / best[BOUND] + 1 / best[GATES])
     ratios = [{"our learning epoch, against": what, "ratio": best[OURS] / value} for what, value in against.items()]
     rows, inner, width = PRODUCT
@@ -169,13 +148,13 @@ def summary(
         f"Ours learns from {best[OURS]:,.0f} steps a second at its best, with {threads} thread{'s' if threads > 1 else ''}: a step "
         f"takes {best[BOUND] / best[OURS]:.2f} times as long as the bound allows. The bound is the machine's rate in products "
         f"{rows} × {inner} by {inner} × {width} ({gflops[0]:.0f} GFLOP/s with one thread, {gflops[1]:.0f} with two) over the "
-        f"{flops:,} operations of one learnt step: {FORWARD_PASSES} forward passes of the network, of which the rollout is one, "
-        "the learning pass one and its gradient two. It leaves out noise, process, features, gate functions and optimiser.",
+        f"{flops:,} operations of one learnt step: the rollout takes every weight of the network once, its gradient twice. It "
+        "leaves out noise, process, features, gate functions and optimiser.",
         "Two seeds side by side, each in a process of one thread, as Snakemake runs them, learn together from "
         f"{best[SIDE_BY_SIDE]:,.0f} steps a second, {best[BOUND] / best[SIDE_BY_SIDE]:.2f} times as long a step as the bound.",
         to_markdown(compared[[*COLUMNS[:9]]], digits=3),
         "Time and memory of an epoch as powers of its size:",
-        to_markdown(fits[["quantity", "against", "threads", "exponent"]], digits=3),
+        to_markdown(fits[["quantity", "against", "exponent"]], digits=3),
         f"At K = {largest['K']:,} and T = {largest['T']}, learning takes {largest['peak_mb']:,.0f} MB beside what Python and torch "
         "take alone.",
     ]
@@ -194,7 +173,7 @@ def machine(load: Mapping[str, tuple[float, ...]], settings: Mapping[str, object
     rows = {
         "processor": processor(),
         "cores": f"{os.cpu_count()} ({available_cores()} available to this process)",
-        "memory": f"{memory_gb():.1f} GB",
+        "memory": f"{psutil.virtual_memory().total / 1e9:.1f} GB",
         "system": f"{platform.system()} {platform.machine()}",
         "vector instructions of torch": torch.backends.cpu.get_cpu_capability(),
         "load average (1, 5, 15 minutes)": "; ".join(
@@ -217,17 +196,3 @@ def processor() -> str:
 def available_cores() -> int:
     """How many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def memory_gb() -> float:
-    """Physical memory in GB (10^9 bytes); nan where the system does not tell."""
-    names = ("SC_PHYS_PAGES", "SC_PAGE_SIZE")
-    if not all(name in getattr(os, "sysconf_names", {}) for name in names):
-        return float("nan")
-    pages, size = (os.sysconf(name) for name in names)
-    return pages * size / 1e9
-
-
-def load_average() -> tuple[float, ...]:
-    """Load average over 1, 5 and 15 minutes; nan where the system has none."""
-    return os.getloadavg() if hasattr(os, "getloadavg") else (float("nan"),) * 3

@@ -1,6 +1,7 @@
 """What is measured: each subject is one repeatable piece of work and the number of learnt steps that it stands for."""
 
 import importlib
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -10,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from benchmarks.one_at_a_time import OneAtATime
 from benchmarks.side_by_side import PROCESSES, SideBySide
-from helpers.learning.algorithm_1 import Reward, algorithm_1
+from helpers.learning.algorithm_1 import algorithm_1
 from helpers.learning.algorithm_2 import apprentice_reward, initial_weights
 from helpers.learning.features import FeatureMap
 from helpers.learning.learner import Learner
@@ -27,11 +29,10 @@ PROJECT = Path(__file__).resolve().parents[1]
 OURS, OURS_AS_SET, ONE_AT_A_TIME = "ours", "ours, with the minibatches of the improved variant", "one episode at a time"
 SIDE_BY_SIDE = "ours, two seeds side by side"  # `threads` of its row counts the processes
 BOUND, GATES = "bound: small-matrix products", "gate functions alone"
+JAX = "the same epoch in JAX, scan and vjp"
 LIBRARY = "RecurrentPPO, {environments} environment(s), {passes} gradient pass(es)"
 LIBRARY_SIZES = ((1, 1), (1, 10), (32, 1), (32, 10))  # environments, gradient passes; 10 is the library's default
 PRODUCT = (500, 40, 80)  # rows, inner width, columns: one layer's gates for a batch of 500, input and hidden side by side
-FORWARD_PASSES = 4  # products of one learnt step: the rollout, the learning pass, and twice that for its backward pass
-GATE_PASSES = 2  # in which gate functions are evaluated: the rollout and the learning pass
 
 
 @dataclass(frozen=True)
@@ -65,22 +66,21 @@ class Subject:
     run: Callable[[], object]
 
 
-def multiply_adds(params: Params) -> int:
-    """Multiply-adds of the policy network for one step of one episode, from its layer widths."""
+def flops_of_a_learnt_step(params: Params) -> int:
+    """Floating-point operations of the products of one learnt step, two a multiply-add, from the network's layer widths.
+
+    The rollout takes the weights once, its gradient twice: for the weights and for the signals, the network's inputs excepted. The
+    gradient starts from what the rollout has computed: there is no learning pass beside it.
+    """
     n_controlled, n_manipulated = len(params.process.controlled), len(params.process.manipulated)
     widths = [n_controlled + n_manipulated, *params.learning.policy.hidden_cells]
     gates = sum(4 * width * (below + width) for below, width in pairwise(widths))
-    return gates + widths[-1] * 2 * n_manipulated
+    return 2 * (3 * (gates + widths[-1] * 2 * n_manipulated) - 4 * widths[1] * widths[0])
 
 
 def gate_functions(params: Params) -> int:
-    """Logistic functions and hyperbolic tangents of one step: four gates and the cell of each layer."""
+    """Logistic functions and hyperbolic tangents of one learnt step, in the rollout: four gates and the cell of each layer."""
     return 5 * sum(params.learning.policy.hidden_cells)
-
-
-def flops_of_a_learnt_step(params: Params) -> int:
-    """Floating-point operations of one learnt step: two a multiply-add, in the passes counted by FORWARD_PASSES."""
-    return 2 * multiply_adds(params) * FORWARD_PASSES
 
 
 @dataclass(frozen=True)
@@ -102,8 +102,10 @@ class Workload:
         """The number type of the paper's scale."""
         return getattr(torch, self.params.learning.scales["paper"].number_type)
 
-    def parts(self, T: int, dtype: torch.dtype | None = None) -> tuple[LSTMPolicy, LinearProcess, FeatureMap, Reward]:
-        """A fresh policy, the process, the features and the reward for episodes of T steps."""
+    def learner(
+        self, K: int, T: int, learner_params: LearnerParams | None = None, dtype: torch.dtype | None = None
+    ) -> tuple[Learner, "partial[Tensor]"]:
+        """A learner of K episodes of T steps an epoch with a fresh policy, and its reward."""
         params, dtype = self.params, dtype or self.dtype
         process_params = params.process.model_copy(update={"horizon": T})
         task = ControlTask.from_params(process_params, params.case, dtype)
@@ -111,14 +113,12 @@ class Workload:
         weights = initial_weights(params.learning.variants["improved"].weights, len(task.set_point), dtype)
         policy = LSTMPolicy.initial(params.learning.policy, task, stream(0, "benchmark", "policy"))
         reward = partial(apprentice_reward, features=features, weights=weights)
-        return policy, LinearProcess(process_params, dtype), features, reward
+        process, generator = LinearProcess(process_params, dtype), stream(0, "benchmark", "learner")
+        return Learner(policy, process, features, learner_params or self.learner_params, K, 10**6, generator), reward
 
     def epoch(self, K: int, T: int, learner_params: LearnerParams | None = None) -> Callable[[], object]:
         """One epoch of the project's learner, ready to be called again and again."""
-        policy, process, features, reward = self.parts(T)
-        generator = stream(0, "benchmark", "learner")
-        learner = Learner(policy, process, features, learner_params or self.learner_params, K, 10**6, generator)
-        return partial(algorithm_1, learner, reward, 1)
+        return partial(algorithm_1, *self.learner(K, T, learner_params), 1)
 
     def ours(self, threads: int, K: int, T: int, epochs: int = 1) -> Subject:
         """Epochs of the project's learner."""
@@ -135,9 +135,15 @@ class Workload:
 
     def one_at_a_time(self, episodes: int, T: int) -> Subject:
         """The usual research style. Its cost is proportional to the episodes, so a few of them tell it."""
-        policy, process, features, reward = self.parts(T)
-        learner = OneAtATime(policy, process, features, self.learner_params, episodes, stream(0, "benchmark", "one at a time"))
-        return Subject(ONE_AT_A_TIME, 1, episodes, T, episodes * T, partial(learner.epoch, reward))
+        learner, reward = self.learner(episodes, T)
+        return Subject(ONE_AT_A_TIME, 1, episodes, T, episodes * T, partial(OneAtATime(learner).epoch, reward))
+
+    def jax(self, K: int, T: int, epochs: int) -> Subject:
+        """The same epochs in JAX, with one thread; needs the package of the `bench` extra."""
+        os.environ |= {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1", "NPROC": "1"}
+        learner, reward = self.learner(K, T)
+        epoch = importlib.import_module("benchmarks.jax_epoch").JaxLearner(learner, reward.keywords["weights"]).epoch
+        return Subject(JAX, 1, K, T, epochs * K * T, repeated(epoch, epochs))
 
     def library(self, environments: int, T: int, passes: int) -> Subject:
         """One batch and its update in RecurrentPPO; needs the packages of the `bench` extra."""
@@ -170,7 +176,7 @@ class Workload:
             torch.sigmoid(values[: 3 * width], out=out[: 3 * width])
             torch.tanh(values[3 * width :], out=out[3 * width :])
 
-        steps = times * values.numel() / (GATE_PASSES * gate_functions(self.params))
+        steps = times * values.numel() / gate_functions(self.params)
         return Subject(GATES, threads, rows, 1, steps, repeated(work, times))
 
 
@@ -184,9 +190,14 @@ def repeated(work: Callable[[], object], times: int) -> Callable[[], None]:
     return run
 
 
+def installed(*packages: str) -> bool:
+    """Whether these packages of the `bench` extra are there."""
+    return all(find_spec(name) is not None for name in packages)
+
+
 def library_installed() -> bool:
-    """Whether the packages of the `bench` extra are there."""
-    return all(find_spec(name) is not None for name in ("gymnasium", "stable_baselines3", "sb3_contrib"))
+    """Whether RecurrentPPO is there."""
+    return installed("gymnasium", "stable_baselines3", "sb3_contrib")
 
 
 def comparison(workload: Workload, size: Size) -> list[Subject]:
@@ -197,6 +208,8 @@ def comparison(workload: Workload, size: Size) -> list[Subject]:
     subjects += [workload.bound(threads, size.products) for threads in (1, 2)]
     subjects += [workload.gates(threads, size.products) for threads in (1, 2)]
     subjects.append(workload.one_at_a_time(size.episodes, size.T))
+    if installed("jax"):
+        subjects.append(workload.jax(size.K, size.T, size.epochs))
     if library_installed():
         subjects += [workload.library(environments, size.T, passes) for environments, passes in LIBRARY_SIZES]
     return subjects

@@ -9,12 +9,11 @@ from helpers.learning.control_quality import (
     harris_index,
     input_figures,
     integral_errors,
-    overshoot,
     quality,
-    rise_time,
     settling_time,
     worst_mean,
 )
+from helpers.learning.evaluation import overshoot, rise_time
 from helpers.plant.rollout import rollout, stream
 from helpers.plant.task import Trajectories
 from helpers.settings.limits import load_limits
@@ -30,39 +29,35 @@ def test_step_response_figures_are_those_of_python_control(frequency, damping, b
     system = control.tf([frequency**2], [1, 2 * damping * frequency, frequency**2])
     _, y = control.step_response(system, TIME)
     expected = control.step_info(y, TIME, yfinal=1.0, SettlingTimeThreshold=band)
-    response = torch.from_numpy(y.copy())[:, None]
-    assert overshoot(response).item() == pytest.approx(expected["Overshoot"] / 100, abs=1e-12)
-    assert rise_time(response, DT).item() == pytest.approx(expected["RiseTime"], abs=1e-9)
-    assert settling_time(response, DT, band).item() == pytest.approx(expected["SettlingTime"], abs=1e-9)
+    error = 1 - torch.from_numpy(y.copy())[:, None]
+    assert overshoot(error).item() == pytest.approx(expected["Overshoot"] / 100, abs=1e-12)
+    assert rise_time(error, DT).item() == pytest.approx(expected["RiseTime"], abs=1e-9)
+    assert settling_time(error, DT, band).item() == pytest.approx(expected["SettlingTime"], abs=1e-9)
 
 
-def test_noise_free_responses_of_the_pid_agree_with_python_control(study, root):
-    """Both loops of the study itself: one comes back after an overshoot, both are about the set point, not the last sample."""
+def test_quality_reads_the_mean_response_and_single_ones_of_both_loops(study, root):
+    """Without noise, so that all responses are one; about the set point, not the last sample: one loop comes back to it."""
     quiet = {"disturbance": (1e-9, 1e-9), "observation_noise": (0.0, 0.0)}
     case = study(1, process=quiet, case_study={"initial_std": (0.0, 0.0)})
     batch = rollout(case.process, case.pid, case.task, 2, stream(0, "quiet"))
-    params = load_limits(root, case.params).quality
+    params, dt = load_limits(root, case.params).quality, case.params.process.sampling_time
     names = (case.params.process.controlled, case.params.process.manipulated)
     found = quality(batch, case.features, params, *names)
-    dt = case.params.process.sampling_time
-    time = np.arange(len(batch.x)) * dt
-    for loop, name in enumerate(names[0]):
-        y = batch.x[:, 0, loop].numpy()
-        for band in params.bands:
-            target = case.task.set_point[loop].item()
-            expected = control.step_info(y, time, yfinal=target, SettlingTimeThreshold=band)
-            settling = found[f"settling_time_{100 * band:g}:{name}"]
-            assert settling == pytest.approx(expected["SettlingTime"], abs=1e-6, nan_ok=True)
-        assert found[f"rise_time:{name}"] == pytest.approx(expected["RiseTime"], abs=1e-6)
-        assert found[f"overshoot:{name}"] == pytest.approx(expected["Overshoot"] / 100, abs=1e-6)
-        assert found[f"rise_time_single:{name}"] == pytest.approx(found[f"rise_time:{name}"], abs=1e-6)
+    error = 1 - batch.x[:, 0] / case.task.set_point  # the steady state is the origin
+    expected = {"overshoot": overshoot(error), "rise_time": rise_time(error, dt)}
+    expected |= {f"settling_time_{100 * band:g}": settling_time(error, dt, band) for band in params.bands}
+    for name, values in expected.items():
+        for kind in ("", "_single"):
+            loops = [found[f"{name}{kind}:{loop}"] for loop in names[0]]
+            assert loops == pytest.approx(values.tolist(), abs=1e-6, nan_ok=True), name
+    assert expected["overshoot"].max() > 0.01
 
 
 def test_what_is_never_reached_is_undefined():
-    response = torch.tensor([[0.0, 0.0], [0.5, 0.95], [0.8, 1.2]])
-    assert rise_time(response, DT).isnan().tolist() == [True, False]
-    assert settling_time(response, DT, 0.05).isnan().all()
-    assert overshoot(response).tolist() == [0.0, pytest.approx(0.2)]
+    error = 1 - torch.tensor([[0.0, 0.0], [0.5, 0.95], [0.8, 1.2]])
+    assert rise_time(error, DT).isnan().tolist() == [True, False]
+    assert settling_time(error, DT, 0.05).isnan().all()
+    assert overshoot(error).tolist() == [0.0, pytest.approx(0.2)]
 
 
 def test_integral_errors_by_hand():

@@ -62,7 +62,7 @@ def test_the_output_layer_is_relu6_mapped_to_the_bounds(study):
     case = study()
     policy, task = case.policy(std_low=0.1, initial_std=0.2, std_high=0.7), case.task
     z = torch.linspace(-4, 10, 57, dtype=F64)[:, None].repeat(1, 4)
-    mean, std = (part.detach().numpy() for part in policy.scale(z, task))
+    mean, std = (part.detach().numpy() for part in policy.scaling(task).outputs(z))
     relu6 = np.minimum(np.maximum(0, z.numpy()), 6)[:, :2]
     low, span = task.input_low.numpy(), (task.input_high - task.input_low).numpy()
     np.testing.assert_allclose(mean, low + span * relu6 / 6, rtol=1e-13, atol=1e-13)
@@ -126,9 +126,6 @@ def test_log_probability_is_that_of_independent_normal_inputs(study):
     found = policy.log_probability(batch.y, batch.u, batch.command, case.task).detach()
     mean, std = numpy_forward(policy, batch.y, batch.u, case.task)
     np.testing.assert_allclose(found, norm.logpdf(batch.command.numpy(), mean, std).sum(-1), rtol=0, atol=1e-9)
-    with torch.no_grad():
-        normal = torch.distributions.Normal(*policy(batch.y, batch.u, case.task))
-    torch.testing.assert_close(found, normal.log_prob(batch.command).sum(-1), rtol=1e-12, atol=1e-12)
     assert found.shape == (50, 7)
 
 
@@ -139,26 +136,16 @@ def test_entropy_is_that_of_inputs_measured_by_their_range(study):
     np.testing.assert_allclose(entropy(std, task), expected, rtol=1e-12)
 
 
-@pytest.mark.equation("3.1.6")
 @pytest.mark.equation("3.2.3")
-def test_only_the_policy_contributes_to_the_gradient_of_a_trajectorys_probability(study):
-    """Finite differences of the whole density p(x_0) p(y_0|x_0) prod pi p(x'|x, u) p(y'|x'), written with scipy."""
+def test_the_gradient_of_the_log_probability_by_finite_differences(study):
+    """Of the density of the commands, written with scipy; the rest of a trajectory's density does not depend on the policy."""
     case = study()
     policy = case.policy(leaky_slope=0.3)
     batch = episodes(case, policy, n=1)
-    x, y, u, command = (getattr(batch, name)[:, 0].numpy() for name in ("x", "y", "u", "command"))
-    params, start = case.params.process, case.task
-    drift = x[:-1] @ np.array(params.drift_state).T + u @ np.array(params.drift_input).T
-    kick = np.abs(np.array(params.disturbance) * x[:-1]) * params.sampling_time**0.5
-    world = (
-        norm.logpdf(x[0], start.initial_mean, start.initial_std).sum()
-        + norm.logpdf(y, x, np.abs(x) * np.array(params.observation_noise)).sum()
-        + norm.logpdf(x[1:], x[:-1] + drift * params.sampling_time, kick).sum()
-    )
 
     def log_density():
         mean, std = numpy_forward(policy, batch.y, batch.u, case.task)
-        return world + norm.logpdf(command, mean[:, 0], std[:, 0]).sum()
+        return norm.logpdf(batch.command.numpy(), mean, std).sum()
 
     policy.log_probability(batch.y, batch.u, batch.command, case.task).sum().backward()
     for parameter in policy.parameters():
@@ -187,60 +174,20 @@ def test_a_fresh_policy_asks_for_inputs_near_the_steady_state(study, low, high):
         np.testing.assert_allclose(policy(batch.y, batch.u, case.task)[0].detach(), 0, atol=1e-12 * span.max())
 
 
-def test_means_and_inputs_stay_inside_the_bounds(study):
-    case = study()
-    policy = stirred(case.policy(), 10.0)
-    batch = episodes(case, policy, n=50)
-    mean, std = policy(batch.y, batch.u, case.task)
-    span = case.task.input_high - case.task.input_low
-    assert (mean == case.task.input_low).any()
-    assert (mean == case.task.input_high).any()
-    for signal in (mean, batch.u):
-        assert (signal >= case.task.input_low).all()
-        assert (signal <= case.task.input_high).all()
-    assert (std >= policy.params.std_low * span * (1 - 1e-12)).all()
-    assert (std <= policy.params.std_high * span * (1 + 1e-12)).all()
-
-
-def test_reset_exploration_restores_the_spread_and_keeps_the_mean(study):
+@pytest.mark.parametrize("limits", [None, {"std_low": 0.1, "std_high": 0.9, "initial_std": 0.3}])
+def test_reset_exploration_restores_the_spread_and_keeps_the_mean(study, limits):
+    """Within the limits of the policy, or within new ones that it takes over."""
     case = study()
     policy = stirred(case.policy())
     batch = episodes(case, policy)
     before = policy(batch.y, batch.u, case.task)
-    policy.reset_exploration()
-    after = policy(batch.y, batch.u, case.task)
-    span = case.task.input_high - case.task.input_low
-    assert torch.equal(before[0], after[0])
-    assert not torch.allclose(before[1], after[1])
-    torch.testing.assert_close(after[1], (policy.params.initial_std * span).expand_as(after[1]), rtol=1e-12, atol=0)
-
-
-def test_reset_exploration_takes_new_limits_and_keeps_the_mean(study):
-    case = study()
-    policy = stirred(case.policy())
-    batch = episodes(case, policy)
-    before = policy(batch.y, batch.u, case.task)
-    policy.reset_exploration(ExplorationParams.model_construct(std_low=0.1, std_high=0.9, initial_std=0.3))
+    policy.reset_exploration(limits and ExplorationParams.model_construct(**limits))
     mean, std = policy(batch.y, batch.u, case.task)
     span = case.task.input_high - case.task.input_low
     assert torch.equal(before[0], mean)
-    torch.testing.assert_close(std, (0.3 * span).expand_as(std), rtol=1e-12, atol=0)
-    with torch.no_grad():
-        policy.output.bias[policy.n_manipulated :] = 99.0
-    torch.testing.assert_close(policy(batch.y, batch.u, case.task)[1], (0.9 * span).expand_as(std), rtol=1e-12, atol=0)
-
-
-def test_the_policy_sees_the_past_and_nothing_later(study):
-    case = study()
-    policy = stirred(case.policy())
-    batch = episodes(case, policy)
-    mean = policy(batch.y, batch.u, case.task)[0]
-    y, u = batch.y.clone(), batch.u.clone()
-    y[21:] += 1
-    u[20:] = -u[20:]  # u_20 itself may not shape the distribution that it is drawn from
-    changed = policy(y, u, case.task)[0]
-    assert torch.equal(mean[:21], changed[:21])
-    assert not torch.allclose(mean[21:], changed[21:])
+    assert not torch.allclose(before[1], std)
+    torch.testing.assert_close(std, (policy.params.initial_std * span).expand_as(std), rtol=1e-12, atol=0)
+    assert limits is None or vars(policy.params).items() >= limits.items()
 
 
 def test_episodes_do_not_share_memory(study):
@@ -249,24 +196,6 @@ def test_episodes_do_not_share_memory(study):
     first = rollout(case.process, controller, case.task, 5, stream(0, "again"))
     rollout(case.process, controller, case.task, 9, stream(1, "again"))  # another batch with the same controller object
     assert torch.equal(first.command, rollout(case.process, controller, case.task, 5, stream(0, "again")).command)
-
-
-def test_trajectories_of_a_batch_do_not_see_each_other(study):
-    case = study()
-    policy = stirred(case.policy())
-    y = torch.randn(10, 6, 2, generator=stream(0, "y"), dtype=F64)
-
-    def commands(observations):
-        controller = PolicyController(policy, case.task, exploring=False)
-        memory, found = controller.start(observations.shape[1], 10, stream(0)), []
-        for observation in observations:
-            command, memory = controller.act(observation, memory)
-            found.append(command.clone())
-        return torch.stack(found)
-
-    together = commands(y)
-    for row in range(6):
-        torch.testing.assert_close(together[:, row : row + 1], commands(y[:, row : row + 1]), rtol=1e-12, atol=1e-10)
 
 
 def test_fresh_policies_depend_on_the_generator_alone(study):

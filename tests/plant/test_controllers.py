@@ -35,11 +35,6 @@ def test_hand_computed_sequence(pid):
     np.testing.assert_allclose(run(pid, y), expected, rtol=1e-14)
 
 
-def test_the_first_sample_has_integral_action_but_no_derivative(pid):
-    y = torch.tensor([[[-9.0, 9.0]]], dtype=torch.float64)
-    np.testing.assert_allclose(run(pid, y)[0, 0], [2 * 10 + 3 * 10 * DT, 10 * -10.0], rtol=1e-14)
-
-
 def test_the_integral_goes_on_beyond_any_bound(pid):
     y = torch.full((1000, 1, 2), -99.0, dtype=torch.float64)
     np.testing.assert_allclose(run(pid, y)[-1, 0, 0], 2 * 100 + 3 * 100 * 1000 * DT, rtol=1e-12)
@@ -54,23 +49,6 @@ def test_episodes_do_not_share_memory(pid):
         _, other = pid.act(-5 * observation, other)
         found, interleaved = pid.act(observation, interleaved)
         assert torch.equal(found, command)
-
-
-def test_trajectories_of_a_batch_do_not_see_each_other(pid):
-    y = torch.randn(20, 4, 2, generator=stream(0, "y"), dtype=torch.float64)
-    together = run(pid, y)
-    for row in range(4):
-        assert torch.equal(together[:, row : row + 1], run(pid, y[:, row : row + 1]))
-
-
-def test_the_memory_of_a_step_is_not_overwritten(pid):
-    memory = pid.start(1, 2, stream(0))
-    _, second = pid.act(torch.ones(1, 2, dtype=torch.float64), memory)
-    assert memory.previous is None
-    assert torch.equal(memory.integral, torch.zeros(1, 2, dtype=torch.float64))
-    kept = second.integral.clone()
-    pid.act(torch.zeros(1, 2, dtype=torch.float64), second)
-    assert torch.equal(second.integral, kept)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -88,9 +66,6 @@ def test_minimum_variance_expects_the_next_state_at_the_set_point(study):
     command, _ = controller.act(x, controller.start(3, 1, stream(0)))
     reached = case.process.step(x, command, torch.zeros_like(x))
     torch.testing.assert_close(reached, case.task.set_point.expand_as(x), rtol=1e-10, atol=1e-10)
-
-
-# Other demonstrators -------------------------------------------------------------------------------------------------
 
 
 def test_predictive_law_against_the_plan_written_out(study):

@@ -30,28 +30,15 @@ def end_without_noise(study, dt, horizon=2.0):
 
 
 @pytest.mark.equation("4.1.3")
-def test_mean_and_covariance_of_one_step(study):
-    process, n = study().process, 200_000
+@pytest.mark.parametrize("dt", [0.04, 0.36])
+def test_mean_and_covariance_of_one_step(study, dt):
+    process, n = study(process={"sampling_time": dt}).process, 200_000
     after = process.step(repeat(X0, n), repeat(U0, n), torch.randn(n, 2, generator=stream(0, "step"), dtype=F64)).numpy()
-    mean, variance = X0 + (A @ X0 + B @ U0) * 0.04, (D * X0) ** 2 * 0.04
+    mean, variance = X0 + (A @ X0 + B @ U0) * dt, (D * X0) ** 2 * dt
     error = after - mean
     np.testing.assert_array_less(np.abs(error.mean(0)), 5 * np.sqrt(variance / n))
     np.testing.assert_array_less(np.abs((error**2).mean(0) / variance - 1), 5 * np.sqrt(2 / n))
     assert abs(np.corrcoef(error.T)[0, 1]) < 5 / np.sqrt(n)  # the Wiener processes of the loops are independent
-
-
-@pytest.mark.equation("4.1.3")
-def test_second_moments_along_a_path(study):
-    """Without input E[x x'] obeys M <- S M S' + dt diag(d^2 M_ii), S = I + A dt, exactly."""
-    process, n, dt = study().process, 100_000, 0.04
-    generator = stream(0, "moments")
-    x, u = repeat(X0, n), torch.zeros(n, 2, dtype=F64)
-    moment, step = np.outer(X0, X0), np.eye(2) + A * dt
-    for _ in range(10):
-        x = process.step(x, u, torch.randn(n, 2, generator=generator, dtype=F64))
-        moment = step @ moment @ step.T + dt * np.diag(D**2 * np.diag(moment))
-    products = np.einsum("ki,kj->kij", x.numpy(), x.numpy())
-    np.testing.assert_array_less(np.abs(products.mean(0) - moment), 5 * products.std(0) / np.sqrt(n))
 
 
 @pytest.mark.equation("4.1.3")
@@ -63,17 +50,6 @@ def test_without_noise_the_step_converges_to_first_order(study):
     ratios = np.array(errors[:-1]) / errors[1:]
     np.testing.assert_allclose(ratios[-3:], 2, rtol=0.02)
     assert errors[-1] < 1e-2 * np.linalg.norm(exact)
-
-
-@pytest.mark.equation("4.1.3")
-def test_the_disturbance_grows_with_the_root_of_the_time_step(study):
-    x, u = repeat(X0, 5), repeat(U0, 5)
-    noise = torch.randn(5, 2, generator=stream(0, "scaling"), dtype=F64)
-    kick = [
-        process.step(x, u, noise) - process.step(x, u, torch.zeros_like(noise))
-        for process in (study(process={"sampling_time": dt}).process for dt in (0.01, 0.09))
-    ]
-    torch.testing.assert_close(kick[1], 3 * kick[0], rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.equation("4.1.3c")
@@ -91,15 +67,6 @@ def test_drift_is_linear_in_state_and_input(study):
     x, u = repeat(X0, 3), repeat(U0, 3)
     still = process.step(x, u, torch.zeros_like(x))
     torch.testing.assert_close(still, x + process.drift(x, u) * 0.04, rtol=1e-13, atol=0)
-
-
-def test_a_step_leaves_its_arguments_alone(study):
-    process = study().process
-    x, u, noise = repeat(X0, 3), repeat(U0, 3), torch.ones(3, 2, dtype=F64)
-    process.step(x, u, noise)
-    assert torch.equal(x, repeat(X0, 3))
-    assert torch.equal(u, repeat(U0, 3))
-    assert torch.equal(noise, torch.ones(3, 2, dtype=F64))
 
 
 @pytest.mark.equation("4.1.4")

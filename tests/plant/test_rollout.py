@@ -1,11 +1,10 @@
-"""The closed loop: draws, bounds, and a plain loop over one episode."""
+"""The closed loop: draws, bounds, and a plain loop over one episode; random streams depend on their seed and purpose alone."""
 
 import numpy as np
 import pytest
 import torch
 
 from helpers.learning.policy import PolicyController
-from helpers.plant.controllers import PID
 from helpers.plant.rollout import rollout, stream
 
 F64 = torch.float64
@@ -36,51 +35,34 @@ class Echo:
         return noise
 
 
-def controllers(case):
-    return {
-        "pid": case.pid,
-        "constant": Constant([3.0, 99.0]),
-        "exploring": PolicyController(case.policy(), case.task, exploring=True),
-        "deployed": PolicyController(case.policy(), case.task, exploring=False),
-    }
+CONTROLLERS = {
+    "pid": lambda case: case.pid,
+    "constant": lambda case: Constant([3.0, 99.0]),
+    "exploring": lambda case: PolicyController(case.policy(), case.task, exploring=True),
+    "deployed": lambda case: PolicyController(case.policy(), case.task, exploring=False),
+}
 
 
-NAMES = ("pid", "constant", "exploring", "deployed")
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_shapes_bounds_and_commands(study, name):
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_shapes_and_bounds_and_the_same_seed_gives_the_same_episodes_bit_for_bit(study, name):
     case = study()
-    batch = rollout(case.process, controllers(case)[name], case.task, 7, stream(0, "rollout"))
+    generators = (stream(seed, "rollout") for seed in (0, 0, 1))
+    batch, again, other = (rollout(case.process, CONTROLLERS[name](case), case.task, 7, drawn) for drawn in generators)
     assert batch.x.shape == batch.y.shape == (51, 7, 2)
     assert batch.u.shape == batch.command.shape == (50, 7, 2)
     assert torch.equal(batch.u, torch.minimum(torch.maximum(batch.command, case.task.input_low), case.task.input_high))
+    if name == "pid":  # which meets the bounds; otherwise this would show nothing
+        assert (batch.u == case.task.input_low).any()
+        assert (batch.u == case.task.input_high).any()
+    assert all(torch.equal(getattr(batch, signal), getattr(again, signal)) for signal in ("x", "y", "u", "command"))
+    assert not torch.equal(batch.x, other.x)
 
 
-def test_the_pid_meets_the_bounds(study):
-    """Otherwise the test of the bounds would show nothing."""
-    case = study()
-    batch = rollout(case.process, case.pid, case.task, 7, stream(0, "rollout"))
-    assert (batch.u == case.task.input_low).any()
-    assert (batch.u == case.task.input_high).any()
-    assert not torch.equal(batch.u, batch.command)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_the_same_seed_gives_the_same_episodes_bit_for_bit(study, name):
-    case = study()
-    first, second, other = (
-        rollout(case.process, controllers(case)[name], case.task, 7, stream(seed, "rollout")) for seed in (0, 0, 1)
-    )
-    assert all(torch.equal(getattr(first, signal), getattr(second, signal)) for signal in ("x", "y", "u", "command"))
-    assert not torch.equal(first.x, other.x)
-
-
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", CONTROLLERS)
 def test_every_controller_meets_the_same_draws(study, name):
     case = study()
     reference = rollout(Echo(), Constant([0.0, 0.0]), case.task, 7, stream(0, "draws"))
-    found = rollout(Echo(), controllers(case)[name], case.task, 7, stream(0, "draws"))
+    found = rollout(Echo(), CONTROLLERS[name](case), case.task, 7, stream(0, "draws"))
     assert torch.equal(reference.x, found.x)
     assert torch.equal(reference.y, found.y)
 
@@ -131,21 +113,6 @@ def test_without_noise_an_episode_is_a_plain_loop(study):
     assert torch.equal(found.x, found.y)
 
 
-@pytest.mark.equation("4.1.3")
-@pytest.mark.equation("4.1.4")
-def test_the_recorded_signals_obey_the_process(study):
-    """The disturbances and observation errors recovered from a batch are standard normal, whatever the controller."""
-    case = study()
-    batch = rollout(case.process, case.pid, case.task, 2000, stream(0, "recover"))
-    x, y, u, params = batch.x.numpy(), batch.y.numpy(), batch.u.numpy(), case.params.process
-    drift = x[:-1] @ np.array(params.drift_state).T + u @ np.array(params.drift_input).T
-    step = (x[1:] - x[:-1] - drift * params.sampling_time) / (np.array(params.disturbance) * x[:-1] * params.sampling_time**0.5)
-    read = (y / x - 1) / np.array(params.observation_noise)
-    for noise in (step, read):
-        assert abs(noise.mean()) < 5 / np.sqrt(noise.size)
-        assert abs(noise.var() - 1) < 5 * np.sqrt(2 / noise.size)
-
-
 def test_rows_of_a_batch_are_independent(study):
     """A trajectory that starts elsewhere leaves the others as they were."""
     case = study()
@@ -163,13 +130,37 @@ def test_rows_of_a_batch_are_independent(study):
     assert not torch.equal(plain.x[:, 0], disturbed.x[:, 0])
 
 
-@pytest.mark.parametrize(("n_controlled", "n_manipulated"), [(1, 1), (3, 3), (3, 2), (2, 4)])
-def test_any_number_of_variables(synthetic, n_controlled, n_manipulated):
-    case = synthetic(n_controlled, n_manipulated)
-    batch = rollout(case.process, PolicyController(case.policy(), case.task, exploring=True), case.task, 6, stream(0))
-    assert batch.x.shape == (13, 6, n_controlled)
-    assert batch.u.shape == (12, 6, n_manipulated)
-    assert case.features.trajectory(batch).shape == (6, 3 * n_controlled)
-    if n_controlled == n_manipulated:
-        pid = PID(case.params.demonstrator, case.task.set_point, case.process.sampling_time)
-        assert rollout(case.process, pid, case.task, 6, stream(0)).u.shape == (12, 6, n_manipulated)
+@pytest.mark.parametrize("n_loops", [1, 3])
+def test_any_number_of_loops(synthetic, n_loops):
+    case = synthetic(n_loops, n_loops)
+    batch = rollout(case.process, case.pid, case.task, 6, stream(0))
+    assert (batch.x.shape, batch.u.shape) == ((13, 6, n_loops), (12, 6, n_loops))
+    assert case.features.trajectory(batch).shape == (6, 3 * n_loops)
+
+
+# Random streams
+
+
+def draw(*arguments, n=1000):
+    return torch.randn(n, generator=stream(*arguments), dtype=torch.float64)
+
+
+def test_the_same_purpose_gives_the_same_numbers_bit_for_bit():
+    first = draw(3, "case", 1, "rollout")
+    torch.manual_seed(99)  # the global generator plays no part
+    before = torch.get_rng_state()
+    stream(3, "another purpose")
+    assert torch.equal(first, draw(3, "case", 1, "rollout"))
+    assert torch.equal(before, torch.get_rng_state())
+
+
+@pytest.mark.parametrize("other", [(4, "case", 1), (3, "case", 2), (3, "cas", "e1"), (3, 1, "case"), (3, "case"), (3,)], ids=str)
+def test_another_seed_or_purpose_gives_unrelated_numbers(other):
+    first, second = draw(3, "case", 1, n=10_000), draw(*other, n=10_000)
+    correlation = np.corrcoef(first, second)[0, 1]
+    assert abs(correlation) < 5 / np.sqrt(10_000)
+
+
+def test_many_seeds_do_not_collide():
+    starts = {draw(seed, "purpose", n=1).item() for seed in range(500)}
+    assert len(starts) == 500

@@ -1,7 +1,7 @@
 """The benchmarks: their arithmetic, their baselines against the project's own code, and what they write. No time is asserted."""
 
+import json
 import platform
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from benchmarks import benchmark, outcome, subjects, whole_run
-from benchmarks.one_at_a_time import OneAtATime, weighed
+from benchmarks.one_at_a_time import OneAtATime
 from benchmarks.subjects import Subject, Workload
 from helpers.learning.learner import surrogate
 from helpers.plant.rollout import stream
@@ -30,26 +30,13 @@ def workload(root):
 # The arithmetic
 
 
-def test_operations_of_a_learnt_step_from_the_parameters_of_the_network(workload):
-    """Every weight takes part in one multiply-add a step; counted here from the policy itself."""
-    policy = workload.parts(5)[0]
+def test_the_bound_counts_what_a_learnt_step_cannot_do_without(workload):
+    """Two operations a multiply-add; every weight in the rollout and twice in its gradient, but for the gradient in the inputs."""
+    policy = workload.learner(2, 5)[0].policy
     weights = sum(parameter.numel() for name, parameter in policy.named_parameters() if "weight" in name)
-    assert subjects.multiply_adds(workload.params) == weights == 5200
-    assert subjects.flops_of_a_learnt_step(workload.params) == 4 * 2 * weights
-
-
-def test_the_bound_counts_two_operations_a_multiply_add(workload):
-    bound = workload.bound(1, 7)
-    assert bound.steps * subjects.flops_of_a_learnt_step(workload.params) == pytest.approx(7 * 2 * 500 * 40 * 80)
-    gates = workload.gates(1, 3)
-    assert gates.steps * 2 * 200 == pytest.approx(3 * 500 * 100)  # two passes through five functions of forty cells
-
-
-def test_exponent_of_a_power_law():
-    sizes = np.array([100, 300, 1000, 3000])
-    assert outcome.fitted_exponent(sizes, 0.02 * sizes**1.25) == pytest.approx((1.25, 0.02))
-    assert np.isnan(outcome.fitted_exponent([5, 5], [1.0, 2.0])).all()
-    assert np.isnan(outcome.fitted_exponent([5, 6], [0.0, 2.0])).all()
+    assert subjects.flops_of_a_learnt_step(workload.params) == 2 * (3 * weights - policy.layers[0].weight_ih_l0.numel()) == 30560
+    assert workload.bound(1, 7).steps * 30560 == pytest.approx(7 * 2 * 500 * 40 * 80)
+    assert workload.gates(1, 3).steps * 200 == pytest.approx(3 * 500 * 100)  # five functions of forty cells in the rollout
 
 
 def test_rates_and_ratios_follow_from_the_median_and_the_bound_of_as_many_threads():
@@ -68,76 +55,88 @@ def test_rates_and_ratios_follow_from_the_median_and_the_bound_of_as_many_thread
     assert frame["peak_mb"][:2].isna().all()
 
 
-def test_a_busy_machine_ends_the_rounds_early_but_not_too_early(monkeypatch):
-    monkeypatch.setattr(benchmark, "ENOUGH_SECONDS", 0.0)
-    timings = benchmark.in_rounds([Subject("a", 1, 1, 1, 1, int)], 9)
-    assert [len(seconds) for seconds in timings.values()] == [benchmark.FEWEST_ROUNDS]
-
-
-def test_every_round_meets_every_subject_once_after_a_warm_up():
+def test_every_round_meets_every_subject_once_after_a_warm_up_and_a_busy_machine_ends_them_early(monkeypatch):
     calls = []
     pair = [Subject(name, 1, 1, 1, 1, lambda name=name: calls.append(name)) for name in "ab"]
-    timings = benchmark.in_rounds(pair, 2)
+    assert [len(seconds) for seconds in benchmark.in_rounds(pair, 2).values()] == [2, 2]
     assert calls == ["a", "b"] * 3
-    assert [len(seconds) for seconds in timings.values()] == [2, 2]
+    monkeypatch.setattr(benchmark, "ENOUGH_SECONDS", 0.0)
+    assert [len(seconds) for seconds in benchmark.in_rounds(pair, 9).values()] == [benchmark.FEWEST_ROUNDS] * 2
 
 
-def test_exponents_of_time_and_memory_are_fitted_along_both_axes(workload):
+def test_exponents_of_time_and_memory_are_fitted_along_both_axes():
     size = replace(subjects.QUICK, many_episodes=(10, 20, 40), many_steps=(2, 4, 8), K=20, T=4)
     pairs = subjects.scaling_sizes(size)
     assert pairs == [(10, 4), (20, 4), (40, 4), (20, 2), (20, 8)]
-    made = {Subject(subjects.OURS, threads, K, T, K * T, print): [K * T**2 / threads] for K, T in pairs for threads in (1, 2)}
+    made = {Subject(subjects.OURS, 1, K, T, K * T, print): [K * T**2] for K, T in pairs}
     scaled = outcome.table(made, {(K, T): K**0.5 * T for K, T in pairs})
-    fits = outcome.exponents(scaled, 20, 4).set_index(["quantity", "against", "threads"])["exponent"]
-    assert fits.to_dict() == pytest.approx(
-        {
-            ("seconds", "K", 1): 1,
-            ("seconds", "K", 2): 1,
-            ("peak_mb", "K", 1): 0.5,
-            ("seconds", "T", 1): 2,
-            ("seconds", "T", 2): 2,
-            ("peak_mb", "T", 1): 1,
-        }
-    )
-    figure = outcome.scaling_figure(scaled, outcome.exponents(scaled, 20, 4), 20, 4)
+    fits = outcome.exponents(scaled, 20, 4)
+    assert fits["exponent"].tolist() == pytest.approx([1, 0.5, 2, 1])  # seconds and memory in K, then in T
+    assert fits["factor"].tolist() == pytest.approx([16, 4, 20, 20**0.5])
+    figure = outcome.scaling_figure(scaled, fits, 20, 4)
     legends = [text.get_text() for axis in figure.axes for text in axis.get_legend().get_texts()]
-    slopes = [float(re.search(r"slope ([\d.]+)", text)[1]) for text in legends]
-    assert slopes == [1, 1, 2, 2, 0.5, 1]
+    assert legends == ["slope 1.00", "slope 2.00", "slope 0.50", "slope 1.00"]
     assert all(axis.get_xscale() == axis.get_yscale() == "log" for axis in figure.axes)
     outcome.plt.close(figure)
+    assert np.isnan(outcome.fitted_exponent([5, 5], [1.0, 2.0])).all()
+    assert np.isnan(outcome.fitted_exponent([5, 6], [0.0, 2.0])).all()
 
 
 # The baselines against the project's own code
 
 
-@pytest.mark.parametrize("credit", ["reward_to_go", "whole_return"])
-def test_one_episode_at_a_time_has_the_loss_and_the_gradient_of_the_batch(workload, credit):
-    policy, process, features, reward = workload.parts(6, F64)
-    with torch.no_grad():  # away from the initial standard deviation, which is the same everywhere
-        for parameter in policy.parameters():
+def shaken(workload, K, T, dtype, credit="reward_to_go"):
+    """A learner away from the initial standard deviation, which is the same everywhere, and its reward."""
+    learner, reward = workload.learner(K, T, workload.learner_params.model_copy(update={"credit": credit}), dtype)
+    with torch.no_grad():
+        for parameter in learner.policy.parameters():
             parameter.add_(0.05 * torch.randn(parameter.shape, generator=stream(1, "shake"), dtype=F64))
-    params = workload.learner_params.model_copy(update={"credit": credit})
-    learner = OneAtATime(policy, process, features, params, 14, stream(0, "episodes"))
-    gain, batch = learner.gain(reward)
+    return learner, reward
+
+
+def project_gradient(learner, reward, batch):
+    """The surrogate of the project's own learner on a batch, and the gradient in the parameters of its policy, which hold it."""
+    log_probability = learner.policy.log_probability(batch.y, batch.u, batch.command, learner.features.task)
+    gain = surrogate(log_probability, learner.advantage(reward(batch), batch))
     gain.backward()
-    log_probability = policy.log_probability(batch.y, batch.u, batch.command, features.task)
-    ours = surrogate(log_probability, weighed(batch, reward, features, params))
-    ours.backward()
+    return gain.item(), {name: parameter.grad for name, parameter in learner.policy.named_parameters()}
+
+
+@pytest.mark.parametrize("credit", ["reward_to_go", "whole_return"])
+def test_one_episode_at_a_time_has_the_loss_and_the_gradient_of_the_batch_and_leaves_the_given_policy_alone(workload, credit):
+    learner, reward = shaken(workload, 14, 6, F64, credit)
+    other = OneAtATime(learner)
+    gain, batch = other.gain(reward)
+    gain.backward()
+    expected, gradient = project_gradient(learner, reward, batch)
     assert batch.x.shape == (7, 14, 2)
-    assert gain.item() == pytest.approx(ours.item(), rel=1e-10, abs=1e-10)
-    theirs = dict(learner.policy.named_parameters())
-    for name, parameter in policy.named_parameters():
-        torch.testing.assert_close(theirs[name].grad, parameter.grad, rtol=1e-10, atol=1e-10)
+    assert gain.item() == pytest.approx(expected, rel=1e-10, abs=1e-10)
+    before = learner.policy.output.bias.detach().clone()
+    for name, parameter in other.policy.named_parameters():
+        torch.testing.assert_close(parameter.grad, gradient[name], rtol=1e-10, atol=1e-10)
         assert parameter.grad.abs().max() > 0
+    other.epoch(reward)
+    assert torch.equal(learner.policy.output.bias, before)
+    assert not torch.equal(other.policy.output.bias, before)
 
 
-def test_one_episode_at_a_time_takes_a_step_and_leaves_the_given_policy_alone(workload):
-    policy, process, features, reward = workload.parts(3)
-    before = policy.output.bias.detach().clone()
-    learner = OneAtATime(policy, process, features, workload.learner_params, 2, stream(0, "episodes"))
-    learner.epoch(reward)
-    assert torch.equal(policy.output.bias, before)
-    assert not torch.equal(learner.policy.output.bias, before)
+@pytest.mark.skipif(not subjects.installed("jax"), reason="needs the extra 'bench'")
+def test_the_epoch_in_jax_has_the_gradient_of_the_batch(workload):
+    from benchmarks.jax_epoch import JaxLearner, jax  # noqa: PLC0415
+
+    learner, reward = shaken(workload, 40, 6, torch.float32)
+    other = JaxLearner(learner, reward.keywords["weights"])
+    noise = other.noise(jax.random.key(1))
+    log_probability, signals = other.episodes(other.theta, noise)
+    x, y, u, command = (torch.from_numpy(np.array(signals[name])) for name in ("x", "y", "u", "command"))
+    batch = Trajectories(torch.cat([x[:1], x]), torch.cat([y, y[-1:]]), u, command)  # x_0 and y_T play no part
+    expected = learner.policy.log_probability(batch.y, u, command, learner.features.task).detach()
+    np.testing.assert_allclose(log_probability, expected, rtol=1e-3, atol=1e-3)
+    found, gradient = other.gradient(other.theta, noise), project_gradient(learner, reward, batch)[1]
+    for name, value in gradient.items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-3, atol=1e-3 * value.abs().max())
+    other.epoch()
+    assert not np.array_equal(other.theta["output.bias"], learner.policy.output.bias.detach())
 
 
 @LIBRARY
@@ -147,26 +146,23 @@ def test_the_environment_is_the_process_with_its_reward(workload, signal):
 
     given = workload.params
     params = type(given)(**{**vars(given), "features": given.features.model_copy(update={"features_on": signal})})
-    policy, process, features, reward = Workload(params, workload.learner_params).parts(8, F64)
+    learner, reward = Workload(params, workload.learner_params).learner(2, 8, dtype=F64)
+    process = learner.process
     env, draws, actions = ProcessEnv(params, 8), np.random.default_rng(), np.random.default_rng(1)
     env.reset(seed=3)
     draws.bit_generator.state = env.np_random.bit_generator.state
-    env_again = ProcessEnv(params, 8)
-    seen, _ = env_again.reset(seed=3)
-    xs, ys, us, rewards, views = [env.x], [env.y], [], [], [seen]
+    xs, ys, us, rewards = [env.x], [env.y], [], []
     for t in range(8):
         action = actions.uniform(-1.5, 1.5, 2)
         noise = draws.standard_normal((2, 2))  # of the process, then of the observation
-        seen, gained, ended, truncated, info = env.step(action)
+        _, gained, ended, truncated, info = env.step(action)
         expected = process.step(*(torch.tensor(value)[None] for value in (xs[-1], info["u"], noise[0])))
         np.testing.assert_allclose(info["x"], expected[0], rtol=1e-12)
         np.testing.assert_allclose(info["y"], process.observe(expected, torch.tensor(noise[1])[None])[0], rtol=1e-12)
         assert (ended, truncated) == (t == 7, False)
-        xs, ys, us, rewards, views = [*xs, info["x"]], [*ys, info["y"]], [*us, info["u"]], [*rewards, gained], [*views, seen]
+        xs, ys, us, rewards = [*xs, info["x"]], [*ys, info["y"]], [*us, info["u"]], [*rewards, gained]
     x, y, u = (torch.tensor(np.array(values))[:, None] for values in (xs, ys, us))
     np.testing.assert_allclose(rewards, reward(Trajectories(x, y, u, u))[:, 0], rtol=1e-10)
-    previous = torch.cat([torch.zeros_like(u[:1]), u])
-    np.testing.assert_allclose(np.array(views), policy.network_inputs(y, previous, features.task)[:, 0], rtol=1e-5, atol=1e-6)
 
 
 @LIBRARY
@@ -183,16 +179,6 @@ def test_the_library_learns_with_our_layers_one_batch_a_run(workload):
 # The whole
 
 
-@pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    out = tmp_path_factory.mktemp("benchmarks")
-    with pytest.MonkeyPatch.context() as patch:  # one process a size takes long; the next test starts one
-        patch.setattr(benchmark, "peak_memory", lambda sizes: {(K, T): 0.1 * K * T for K, T in sizes})
-        patch.setattr(benchmark, "code_revision", lambda _: "abc+changes" if any(out.iterdir()) else "abc")
-        assert benchmark.main(["--quick", "--out", str(out)]) == 0
-    return out
-
-
 @pytest.mark.torture
 def test_peak_memory_is_that_of_learning_alone():
     """Without the hundreds of MB that Python and torch take."""
@@ -200,65 +186,45 @@ def test_peak_memory_is_that_of_learning_alone():
 
 
 @pytest.mark.torture
-def test_a_quick_run_writes_everything(written):
-    frame = pd.read_csv(written / "benchmarks.csv")
-    size = subjects.QUICK
+def test_a_quick_run_writes_everything(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmark, "peak_memory", lambda sizes: {(K, T): 0.1 * K * T for K, T in sizes})  # a process a size
+    monkeypatch.setattr(benchmark, "code_revision", lambda _: "abc+changes" if any(tmp_path.iterdir()) else "abc")
+    assert benchmark.main(["--quick", "--out", str(tmp_path)]) == 0
+    names = {"benchmarks.csv", "exponents.csv", "machine.md", "scaling.png", "scaling.svg", "summary.md"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    frame = pd.read_csv(tmp_path / "benchmarks.csv")
     assert list(frame.columns[:6]) == FIRST_COLUMNS
     compared = frame[~frame["what"].str.startswith("scaling")]
     rows = set(compared[["what", "threads"]].itertuples(index=False, name=None))
     for what in (subjects.OURS, subjects.OURS_AS_SET, subjects.BOUND, subjects.GATES):
         assert {(what, 1), (what, 2)} <= rows
     assert (subjects.SIDE_BY_SIDE, 2) in rows
-    assert len(compared) == 10 + 4 * subjects.library_installed()
-    assert len(frame) - len(compared) == len(subjects.scaling_sizes(size))
+    assert len(compared) == 10 + 4 * subjects.library_installed() + subjects.installed("jax")
+    assert len(frame) - len(compared) == len(subjects.scaling_sizes(subjects.QUICK))
     assert (frame[["steps_per_s", "ratio_to_bound", "seconds_min"]] > 0).all(axis=None)
     assert frame["seconds"].between(frame["seconds_min"], frame["seconds_max"]).all()
-    assert {path.name for path in written.iterdir()} == {
-        "benchmarks.csv",
-        "exponents.csv",
-        "machine.md",
-        "scaling.png",
-        "scaling.svg",
-        "summary.md",
-    }
-
-
-@pytest.mark.torture
-def test_the_summary_begins_with_ratios_and_no_file_names_a_place(written):
-    text = (written / "summary.md").read_text(encoding="utf-8")
-    assert text.index("Ratio") < text.index("Seconds")
-    assert subjects.ONE_AT_A_TIME in text
-    for name in ("summary.md", "machine.md", "scaling.svg"):
-        content = (written / name).read_text(encoding="utf-8")
-        assert str(Path.home()) not in content
-        assert str(subjects.PROJECT) not in content
-        assert platform.node() not in content
-
-
-@pytest.mark.torture
-def test_what_a_run_writes_is_no_change_of_the_code_it_measured(written):
-    row = next(line for line in (written / "machine.md").read_text(encoding="utf-8").splitlines() if "code" in line.lower())
-    assert row.split("|")[2].strip() == "abc"
+    texts = {name: (tmp_path / name).read_text(encoding="utf-8") for name in ("summary.md", "machine.md", "scaling.svg")}
+    assert texts["summary.md"].index("Ratio") < texts["summary.md"].index("Seconds")
+    assert subjects.ONE_AT_A_TIME in texts["summary.md"]
+    assert not [name for name in texts for place in (Path.home(), subjects.PROJECT, platform.node()) if str(place) in texts[name]]
+    row = next(line for line in texts["machine.md"].splitlines() if "code" in line.lower())
+    assert row.split("|")[2].strip() == "abc"  # what a run writes is no change of the code that it measured
 
 
 def test_stages_are_read_from_the_records_of_the_run(tmp_path):
     """One stage with two results is one row; the report has no record of its own."""
     log = "results/paper/seed_0/case_3/notebooks/04_knowledge_transfer_improved.ipynb"
-    metadata = tmp_path / ".snakemake/metadata"
-    metadata.mkdir(parents=True)
-    jobs = {"b": (log, 20.0, 32.0), "c": (log, 20.0, 32.0), "a": ("reports/notebooks/05_report.ipynb", 40.0, 45.0)}
-    for name, (path, start, end) in jobs.items():
-        (metadata / name).write_text(f'{{"log": ["{path}"], "starttime": {start}, "endtime": {end}}}')
-    for folder, notebook, variant, seconds in (
-        ("transfer_improved", "04_knowledge_transfer", "improved", 5.0),
-        ("online_improved", "04_knowledge_transfer", "improved", 7.5),
-        ("transfer_printed", "04_knowledge_transfer", "printed", 9.0),
-    ):
-        path = tmp_path / "results/paper/seed_0/case_3" / folder / "record.json"
-        path.parent.mkdir(parents=True)
-        path.write_text(f'{{"notebook": "{notebook}", "variant": "{variant}", "seconds": {seconds}}}')
-    names = ("stage", "case", "variant", "seconds", "work", "around")
-    assert [tuple(row[name] for name in names) for row in whole_run.stage_times(tmp_path)] == [
+    jobs = {"b": ([log], 20.0, 32.0), "c": ([log], 20.0, 32.0), "a": (["reports/notebooks/05_report.ipynb"], 40.0, 45.0)}
+    files = {
+        f".snakemake/metadata/{name}": dict(zip(("log", "starttime", "endtime"), job, strict=True)) for name, job in jobs.items()
+    }
+    for folder, seconds in (("transfer_improved", 5.0), ("online_improved", 7.5), ("transfer_printed", 9.0)):
+        record = {"notebook": "04_knowledge_transfer", "variant": folder.partition("_")[2], "seconds": seconds}
+        files[f"results/paper/seed_0/case_3/{folder}/record.json"] = record
+    for name, content in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(json.dumps(content))
+    assert [tuple(row[name] for name in whole_run.COLUMNS) for row in whole_run.stage_times(tmp_path)] == [
         ("04_knowledge_transfer", 3, "improved", 12.0, 7.5, 4.5),
         ("05_report", None, "", 5.0, 0.0, 5.0),
     ]

@@ -62,7 +62,7 @@ def test_the_variants_of_the_paper_use_none_of_the_optional_settings(root):
     learning = load(root, 1).learning
     for name in ("improved", "printed"):
         variant = learning.variants[name]
-        assert (variant.exploration, variant.learner.entropy, variant.learner.trust_region) == (None, 0, None)
+        assert (variant.exploration, variant.learner.entropy) == (None, 0)
 
 
 REFUSED = [
@@ -80,7 +80,6 @@ REFUSED = [
     ({"constant_step.learner.rate": leaf(0.1)}, "constant_step.learner.rate", "unknown"),
     ({"constant_step.learner.minibatches": leaf(41, "per pass")}, "constant_step.learner.minibatches", "40 episodes"),
     ({"constant_step.learner.entropy": leaf(-0.1)}, "constant_step.learner.entropy", "greater than or equal to 0"),
-    ({"natural_gradient.learner.trust_region.value": 0.0}, "natural_gradient.learner.trust_region", "greater than 0"),
     ({"wide_exploration.exploration.std_low": DELETE}, "wide_exploration.exploration.std_low", "missing"),
     ({"wide_exploration.exploration.initial_std.value": 0.9}, "wide_exploration.exploration", "std_high"),
     ({"improved": {"base": "printed", "title": "a", "family": "credit", "weights": {"step": leaf(0.1)}}}, "improved", "other than"),

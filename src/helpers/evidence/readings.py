@@ -180,4 +180,4 @@ def simulate(params: Params, values: Values, reading: Reading, n_trajectories: i
         signal = trajectories.x if params.features.features_on == "x" else trajectories.y
         first = normalised_error(signal[0], task.set_point, task.error_scale).abs()
         v = torch.cat([v[:, : -first.shape[1]], v[:, -first.shape[1] :] - first / time], dim=1)
-    return Simulated(v, overshoot(trajectories, features))
+    return Simulated(v, overshoot(normalised_error(trajectories.x.mean(1), task.set_point, task.error_scale)))

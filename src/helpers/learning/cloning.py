@@ -56,15 +56,13 @@ def clone(
         raise TrainingError(f"cloning needs two demonstrations or more, one of them to validate on, found {n_all}")
     n_held = max(1, round(params.validation * n_all))
     held, used = torch.arange(n_all - n_held, n_all), n_all - n_held
-    optimiser = Adam(policy.parameters(), lr=params.learning_rate_start)
+    optimiser = Adam(policy.parameters())
     best = Cloning(policy, 0, float("inf"))
     for step in range(1, n_steps + 1):
-        for group in optimiser.param_groups:
-            group["lr"] = annealed(params.learning_rate_start, params.learning_rate_end, (step - 1) / max(1, n_steps - 1))
         rows = torch.randperm(used, generator=generator)[: params.batch]
-        optimiser.zero_grad()
+        policy.zero_grad()
         cloning_loss(policy, demonstrations, rows, task).backward()
-        optimiser.step()
+        optimiser.step(annealed(params.learning_rate_start, params.learning_rate_end, (step - 1) / max(1, n_steps - 1)))
         if step % params.check_every == 0 or step == n_steps:
             with torch.no_grad():
                 loss = cloning_loss(policy, demonstrations, held, task).item()

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from helpers.learning.features import FeatureMap
+from helpers.learning.evaluation import overshoot, rise_time, total_variation
+from helpers.learning.features import FeatureMap, normalised_error
 from helpers.plant.task import Trajectories
 from helpers.settings.limits import QualityParams
 
-RISE = (0.1, 0.9)
 AT_BOUND = 1e-6  # share of the range: an interpolated input may miss its bound by a last digit
 
 
@@ -31,27 +31,11 @@ def integral_errors(error: Tensor, sampling_time: float) -> dict[str, Tensor]:
     return {name: sampling_time * integrand.sum(0) for name, integrand in integrands.items()}
 
 
-def rise_time(response: Tensor, sampling_time: float) -> Tensor:
-    """Time between first reaching 10 and first reaching 90 % of the set point change; (T + 1, ...) to (...); nan if never.
-
-    Args:
-        response: 1 - e at t = 0..T.
-    """
-    first = [torch.where((response >= level).any(0), (response >= level).int().argmax(0).double(), torch.nan) for level in RISE]
-    return (first[1] - first[0]) * sampling_time
-
-
-def settling_time(response: Tensor, sampling_time: float, band: float) -> Tensor:
-    """First time from which on |1 - response| stays below `band`; (T + 1, ...) to (...); nan if outside at the end."""
-    outside = (response - 1).abs() >= band
-    count = torch.arange(1, len(response) + 1).reshape(-1, *[1] * (response.ndim - 1))
-    settled = (outside * count).amax(0).double()
-    return torch.where(settled < len(response), settled * sampling_time, torch.nan)
-
-
-def overshoot(response: Tensor) -> Tensor:
-    """How far the response passes the set point, as a share of the set point change; (T + 1, ...) to (...)."""
-    return (response.amax(0) - 1).clamp(min=0)
+def settling_time(error: Tensor, sampling_time: float, band: float) -> Tensor:
+    """First time from which on |e| stays below `band`; e at t = 0..T, (T + 1, ...) to (...); nan if outside at the end."""
+    count = torch.arange(1, len(error) + 1).reshape(-1, *[1] * (error.ndim - 1))
+    settled = ((error.abs() >= band) * count).amax(0).double()
+    return torch.where(settled < len(error), settled * sampling_time, torch.nan)
 
 
 def worst_mean(values: Tensor, share: float) -> Tensor:
@@ -86,7 +70,7 @@ def input_figures(trajectories: Trajectories, low: Tensor, high: Tensor) -> dict
     """Total variation sum_t |u_t - u_(t-1)|, mean over trajectories, and share of samples at a bound; each (n_u,)."""
     u, reach = trajectories.u, AT_BOUND * (high - low)
     at_bound = (u <= low + reach) | (u >= high - reach)
-    return {"total_variation": u.diff(dim=0).abs().sum(0).mean(0), "at_bound": at_bound.to(u.dtype).mean((0, 1))}
+    return {"total_variation": total_variation(u), "at_bound": at_bound.to(u.dtype).mean((0, 1))}
 
 
 def quality(
@@ -99,14 +83,12 @@ def quality(
     which they are defined, and with _reached the share of those.
     """
     dt, task = features.sampling_time, features.task
-    on_state = features.on("x")
-    error = on_state.errors(trajectories).double()
-    response = ((trajectories.x - task.set_point) / task.error_scale + 1).double()
-    figures = integral_errors(error, dt)
+    error = normalised_error(trajectories.x, task.set_point, task.error_scale).double()
+    figures = integral_errors(error[1:], dt)
     rows = {name: values.mean(0) for name, values in figures.items()}
     rows["iae_worst"] = worst_mean(figures["iae"], params.worst)
     rows["offset"] = error[-params.n_last :].mean((0, 1))
-    for kind, signal in (("", response.mean(1)), ("_single", response)):
+    for kind, signal in (("", error.mean(1)), ("_single", error)):
         found = {"overshoot": overshoot(signal), "rise_time": rise_time(signal, dt)}
         found |= {f"settling_time_{100 * band:g}": settling_time(signal, dt, band) for band in params.bands}
         for name, values in found.items():

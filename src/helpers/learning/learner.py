@@ -1,13 +1,11 @@
 """What Algorithm 1 is made of: returns and advantages, surrogates of the policy gradient, and the learner that takes the steps.
 
 As printed: the whole return less its mean over the batch, and one plain step an epoch. Ours are reward-to-go with a regression
-baseline, clipped steps on minibatches, an entropy bonus, a step size that falls, a running average of the weights, and the natural
-gradient.
+baseline, clipped steps on minibatches, an entropy bonus, a step size that falls, and a running average of the weights.
 """
 
 import copy
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -16,7 +14,6 @@ from torch import Tensor
 from helpers.learning.evaluation import expected_features
 from helpers.learning.features import FeatureMap, accumulated_error, discounts, normalised_error
 from helpers.learning.lstm import Tape
-from helpers.learning.natural import precondition
 from helpers.learning.optimiser import Adam
 from helpers.learning.policy import LSTMPolicy, PolicyController, entropy, log_density
 from helpers.plant.process import Process
@@ -26,7 +23,6 @@ from helpers.settings.paper import LearnerParams
 
 BLOCK = 1000  # episodes whose gradient is computed at once: more would only take memory
 FEW = 100  # episodes below which torch's own LSTM is faster than the gradient through time written out: 7 against 17 ms for 50
-Reward = Callable[[Trajectories], Tensor]  # rewards R_1..R_T, shape (T, K)
 
 
 class TrainingError(RuntimeError):
@@ -69,10 +65,10 @@ def regression_advantage(rewards: Tensor, gamma: float, decay: float, regressors
         regressors: shape (T, K, p); row t was known before u_t was drawn. A constant is added here.
     """
     future = reward_to_go(rewards, gamma, decay)
-    design = torch.cat([torch.ones_like(regressors[..., :1]), regressors], dim=-1)
-    ridge = 1e-3 * rewards.shape[1] * torch.eye(design.shape[-1], dtype=design.dtype)
-    coefficients = torch.linalg.solve(design.mT @ design + ridge, design.mT @ future[..., None])
-    return future - (design @ coefficients)[..., 0]
+    design = torch.cat([torch.ones_like(future)[:, None], regressors.mT], dim=1)  # in memory the trajectories come last
+    ridge = 1e-3 * rewards.shape[1] * torch.eye(design.shape[1], dtype=design.dtype)
+    coefficients = torch.linalg.solve(design @ design.mT + ridge, design @ future[..., None])
+    return future - (coefficients.mT @ design)[:, 0]
 
 
 def baseline_regressors(trajectories: Trajectories, features: FeatureMap) -> Tensor:
@@ -84,7 +80,7 @@ def baseline_regressors(trajectories: Trajectories, features: FeatureMap) -> Ten
     error = normalised_error(trajectories.y[:-1], task.set_point, task.error_scale)
     integral = accumulated_error(error, features.sampling_time)
     previous = torch.cat([torch.zeros_like(trajectories.u[:1]), trajectories.u[:-1]]) / (task.input_high - task.input_low)
-    return torch.cat([error, error.abs(), error**2, integral, previous], dim=-1)
+    return torch.cat([entry.mT for entry in (error, error.abs(), error**2, integral, previous)], dim=1).mT
 
 
 def surrogate(log_probability: Tensor, advantage: Tensor) -> Tensor:
@@ -134,6 +130,7 @@ class Learner:
         policy: the policy that explores and takes the gradient steps.
         average: the exponential average of its weights, which is what is kept in the end. With an averaging coefficient
             of zero it equals the policy.
+        rate: the present learning rate.
         epochs, episodes, gradient_steps: counted up as they are spent.
     """
 
@@ -155,18 +152,16 @@ class Learner:
         self.n_episodes = n_episodes
         self.total_epochs = total_epochs
         self.generator = generator
-        # With the natural gradient, the learning rate is the share of the trust region that a step takes.
-        kind: type[Adam] | type[torch.optim.SGD] = Adam if params.trust_region is None else torch.optim.SGD
-        self.optimiser = kind(policy.parameters(), lr=params.learning_rate_start)
+        self.optimiser, self.rate = Adam(policy.parameters()), params.learning_rate_start
         self.epochs = self.episodes = self.gradient_steps = 0
-        self._tapes: list[Tape] = []
+        self._tape: Tape | None = None
 
     def realise(self) -> Trajectories:
         """Step 1 of Algorithm 1: K episodes of T steps under the exploring policy."""
         task, recording = self.features.task, self.n_episodes <= BLOCK
-        controller = PolicyController(self.policy, task, exploring=True, recording=recording, used=self._tapes)
+        controller = PolicyController(self.policy, task, exploring=True, recording=recording, used=self._tape)
         batch = rollout(self.process, controller, task, self.n_episodes, self.generator)
-        self._tapes = controller.tapes
+        self._tape = controller.tape
         return batch
 
     def advantage(self, rewards: Tensor, batch: Trajectories) -> Tensor:
@@ -194,25 +189,29 @@ class Learner:
             TrainingError: if the gradient is not finite.
         """
         params = self.params
-        rate = annealed(params.learning_rate_start, params.learning_rate_end, self.epochs / max(1, self.total_epochs - 1))
-        for group in self.optimiser.param_groups:
-            group["lr"] = rate
+        self.rate = annealed(params.learning_rate_start, params.learning_rate_end, self.epochs / max(1, self.total_epochs - 1))
         self._ascend(batch, advantage)
         self.epochs += 1
         self.episodes += self.n_episodes
-        self._update_average()
+        # The warm-up keeps the untrained first weights from lingering in the average.
+        keep = min(params.averaging, self.epochs / (self.epochs + 9)) if params.averaging else 0.0
+        with torch.no_grad():
+            for average, current in zip(self.average.parameters(), self.policy.parameters(), strict=True):
+                average.lerp_(current, 1 - keep)
 
     def record(self, rewards: Tensor, batch: Trajectories) -> EpochRecord:
-        """What the epoch that has just ended gave."""
-        returns = discounted_return(rewards, self.features.params.discount)
+        """What the epoch that has just ended gave; how far the policy explores is read off one trajectory."""
+        returns, task = discounted_return(rewards, self.features.params.discount), self.features.task
+        with torch.no_grad():
+            std = self.policy(batch.y[:, :1], batch.u[:, :1], task)[1]
         return EpochRecord(
             self.epochs,
             self.episodes,
             self.gradient_steps,
             returns.mean().item(),
             returns.std().item() / self.n_episodes**0.5,
-            self.optimiser.param_groups[0]["lr"],
-            self._exploration(batch),
+            self.rate,
+            (std / (task.input_high - task.input_low)).mean().item(),
         )
 
     def expected_features(self, n_episodes: int) -> Tensor:
@@ -224,7 +223,7 @@ class Learner:
             TrainingError: if the features are not finite.
         """
         mode = PolicyController(self.policy, self.features.task, exploring=False)
-        v = expected_features(self.process, mode, self.features, n_episodes, self.generator).mean
+        v = expected_features(self.process, mode, self.features, n_episodes, self.generator)
         self.episodes += n_episodes
         if not torch.isfinite(v).all():
             raise TrainingError(f"epoch {self.epochs}: the trajectory features of the policy are not finite")
@@ -242,11 +241,11 @@ class Learner:
         drawn = None
         if n_steps > 1:
             with torch.no_grad():
-                drawn = log_density(batch.command, *self._distribution(batch, slice(0, self.n_episodes), bool(self._tapes)))
+                drawn = log_density(batch.command, *self._distribution(batch, slice(0, self.n_episodes), self._tape is not None))
         for step in range(n_steps):
             first, last = edges[step % params.minibatches], edges[step % params.minibatches + 1]
-            recorded = step == 0 and bool(self._tapes)  # later on the tapes are those of an older policy
-            self.optimiser.zero_grad()
+            recorded = step == 0 and self._tape is not None  # later on the tape is that of an older policy
+            self.policy.zero_grad()
             for start in range(first, last, BLOCK):
                 rows = slice(start, min(start + BLOCK, last))
                 mean, std = self._distribution(batch, rows, recorded)
@@ -258,35 +257,16 @@ class Learner:
                 if params.entropy:
                     gain = gain + params.entropy * entropy(std, self.features.task).sum(0).mean()
                 (-gain * (rows.stop - rows.start) / (last - first)).backward()
-            self._check_gradient()
-            if params.trust_region is not None:
-                precondition(self.policy, batch, self.features.task, params.trust_region)
-            self.optimiser.step()
+            for name, parameter in self.policy.named_parameters():
+                if parameter.grad is not None and not parameter.grad.isfinite().all():
+                    cause = f"the gradient of {name} is not finite at the learning rate {self.rate:g}"
+                    raise TrainingError(f"epoch {self.epochs + 1}: {cause}")
+            self.optimiser.step(self.rate)
             self.gradient_steps += 1
 
     def _distribution(self, batch: Trajectories, rows: slice, recorded: bool) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the present policy along some episodes."""
         if not recorded and rows.stop - rows.start < FEW:
             return self.policy(batch.y[:, rows], batch.u[:, rows], self.features.task)
-        tapes = [tape.part(rows) for tape in self._tapes]
-        return self.policy.unrolled(batch.y[:, rows], batch.u[:, rows], self.features.task, tapes, recorded)
-
-    def _check_gradient(self) -> None:
-        rate = self.optimiser.param_groups[0]["lr"]
-        for name, parameter in self.policy.named_parameters():
-            if parameter.grad is not None and not parameter.grad.isfinite().all():
-                raise TrainingError(f"epoch {self.epochs + 1}: the gradient of {name} is not finite at the learning rate {rate:g}")
-
-    def _exploration(self, batch: Trajectories) -> float:
-        """Standard deviation of the policy as a share of the input range, along one trajectory."""
-        task = self.features.task
-        with torch.no_grad():
-            std = self.policy(batch.y[:, :1], batch.u[:, :1], task)[1]
-        return (std / (task.input_high - task.input_low)).mean().item()
-
-    def _update_average(self) -> None:
-        # The warm-up keeps the untrained first weights from lingering in the average.
-        keep = min(self.params.averaging, self.epochs / (self.epochs + 9)) if self.params.averaging else 0.0
-        with torch.no_grad():
-            for average, current in zip(self.average.parameters(), self.policy.parameters(), strict=True):
-                average.lerp_(current, 1 - keep)
+        tape = self._tape and self._tape.part(rows.start, rows.stop)
+        return self.policy.unrolled(batch.y[:, rows], batch.u[:, rows], self.features.task, tape, recorded)

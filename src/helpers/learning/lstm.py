@@ -1,27 +1,30 @@
-"""An LSTM layer, features first: one step, and the gradient through time written out.
+"""A stack of LSTM layers, features first: one step, and the gradient through time written out.
 
-The mathematics is that of torch.nn.LSTM, whose parameters it takes. It exists for speed: a rollout needs one step at a
-time, and the gradient can start from what the rollout has computed already. Arrays have their features first and the
-trajectories last, so that every gate is a contiguous block.
+The mathematics is that of torch.nn.LSTM, whose parameters it takes, with a leaky ReLU on what each layer hands up. It exists for
+speed: a rollout needs one step at a time, and the gradient can start from what the rollout has computed already. Arrays have their
+features first and the trajectories last, so that every gate is a contiguous block.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-# d z from d a, where a = sigmoid(z) or a = tanh(z), as torch's own backward passes compute it.
+leaky_relu = torch.ops.aten.leaky_relu.out
+# d z from d a, where a = sigmoid(z), tanh(z) or leaky_relu(z), as torch's own backward passes compute it.
 sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input
 tanh_backward = torch.ops.aten.tanh_backward.grad_input
+leaky_relu_backward = torch.ops.aten.leaky_relu_backward.grad_input
+MINUS_ONE, TWO = torch.tensor(-1.0), torch.tensor(2.0)  # a number of Python's would be made a tensor at every call
 
 
 class Moment(NamedTuple):
-    """Views of one step of a tape, made once: to cut them out anew at every step takes longer than what is done with them.
+    """Views of one step of a layer, made once: to cut them out anew at every step takes longer than what is done with them.
 
     `signal` is [x_t, 1, h_{t-1}] and `inputs` its part x_t (n_in, K); `gates` are (4 n, K), `logistic` their part i_t, f_t, o_t,
-    whose parts are `entry`, `forget` and `exit`; `candidate` is g_t. The rest is c_{t-1}, c_t, tanh(c_t) and h_t, each (n, K).
+    whose parts are `entry`, `forget` and `exit`; `candidate` is g_t. The rest is c_{t-1}, c_t, tanh(c_t), h_t and what the layer
+    hands up, each (n, K).
     """
 
     signal: Tensor
@@ -36,182 +39,172 @@ class Moment(NamedTuple):
     cell: Tensor
     squashed: Tensor
     hidden: Tensor
+    output: Tensor
 
 
-@dataclass(frozen=True)
-class Tape:
-    """All that one layer computed along its last T steps of K trajectories; n cells, n_in inputs.
-
-    A tape as long as the episode holds what the gradient needs; a tape of one step is all that control needs.
+class Layer(NamedTuple):
+    """What one layer computed along the last T steps of K trajectories; n cells, n_in inputs.
 
     Attributes:
-        signals: [x_t, 1, h_{t-1}] for t = 0..T, shape (T + 1, n_in + 1 + n, K); the last x is never set. The row of ones
-            carries the bias, so that one product makes all gates.
-        gates: i_t, f_t, o_t and g_t after their activations, shape (T, 4 n, K): those with the logistic function first.
+        signals: [x_t, 1, h_{t-1}] for t = 0..T, shape (T + 1, n_in + 1 + n, K). The row of ones carries the bias, so that one
+            product makes all gates.
+        gates: i_t, f_t, o_t and g_t after their activations, shape (T, 4 n, K).
         cells: c_{t-1} for t = 0..T, shape (T + 1, n, K).
         squashed: tanh(c_t), shape (T, n, K).
-        moments: the views of each step. A tape of one step turns in a circle, so it has two of them.
     """
 
     signals: Tensor
     gates: Tensor
     cells: Tensor
     squashed: Tensor
-    moments: tuple[Moment, ...]
-
-    @classmethod
-    def over(cls, signals: Tensor, gates: Tensor, cells: Tensor, squashed: Tensor) -> "Tape":
-        """The tape over this memory."""
-        n_steps, width = squashed.shape[:2]
-        signal, gate, cell, tanh = (entry.unbind(0) for entry in (signals, gates, cells, squashed))
-        n_inputs = signals.shape[1] - 1 - width
-        moments = []
-        for t in range(max(n_steps, 2)):
-            now, after, row = t % (n_steps + 1), (t + 1) % (n_steps + 1), t % n_steps
-            entry, forget, exit_, candidate = gate[row].split(width)
-            moments.append(
-                Moment(
-                    signal=signal[now],
-                    inputs=signal[now][:n_inputs],
-                    gates=gate[row],
-                    logistic=gate[row][: 3 * width],
-                    entry=entry,
-                    forget=forget,
-                    exit=exit_,
-                    candidate=candidate,
-                    cell_before=cell[now],
-                    cell=cell[after],
-                    squashed=tanh[row],
-                    hidden=signal[after][n_inputs + 1 :],
-                )
-            )
-        return cls(signals, gates, cells, squashed, tuple(moments))
-
-    @classmethod
-    def blank(cls, n_steps: int, weight: Tensor, n_trajectories: int, used: "Tape | None" = None) -> "Tape":
-        """A tape at its start, hidden and cell state zero, for a layer with these `stacked` weights.
-
-        A used tape of the same shape is wound back instead: new memory costs as much time as filling it.
-        """
-        width = weight.shape[0] // 4
-        shape = (n_steps, weight.shape[0], n_trajectories)
-        if used is not None and used.gates.shape == shape and used.gates.dtype == weight.dtype:
-            return used.wound_back()
-        return cls.over(
-            signals=weight.new_ones(n_steps + 1, weight.shape[1], n_trajectories),
-            gates=weight.new_empty(shape),
-            cells=weight.new_empty(n_steps + 1, width, n_trajectories),
-            squashed=weight.new_empty(n_steps, width, n_trajectories),
-        ).wound_back()
-
-    def wound_back(self) -> "Tape":
-        """The tape itself, at its start."""
-        self.signals[0, -self.cells.shape[1] :] = 0
-        self.cells[0] = 0
-        return self
-
-    def part(self, rows: slice) -> "Tape":
-        """The tape of some neighbouring trajectories, in the same memory."""
-        if len(range(self.gates.shape[-1])[rows]) == self.gates.shape[-1]:
-            return self
-        return Tape.over(*(entry[..., rows] for entry in (self.signals, self.gates, self.cells, self.squashed)))
 
     @property
     def inputs(self) -> Tensor:
-        """x_0..x_{T-1}, shape (T, n_in, K)."""
-        return self.signals[:-1, : -1 - self.cells.shape[1]]
+        """x_0..x_T, shape (T + 1, n_in, K); the last is never set."""
+        return self.signals[:, : -1 - self.cells.shape[1]]
 
-    @property
-    def hidden(self) -> Tensor:
-        """h_0..h_{T-1}, shape (T, n, K)."""
-        return self.signals[1:, -self.cells.shape[1] :]
-
-    def at(self, t: int) -> Moment:
-        """The views of step t."""
-        return self.moments[t % len(self.moments)]
+    def moments(self, output: Tensor) -> Iterator[Moment]:
+        """The views of each step; after the last row comes the first, so that as many rows as steps make a circle."""
+        width = self.cells.shape[1]
+        now = (self.signals, self.inputs, self.gates, self.gates[:, : 3 * width], *self.gates.split(width, dim=1), self.cells)
+        cell, hidden = (rows[1:] + rows[:1] for rows in (self.cells.unbind(0), self.signals[:, -width:].unbind(0)))
+        return map(Moment, *(entry.unbind(0) for entry in now), cell, self.squashed.unbind(0), hidden, output.unbind(0))
 
 
-def step(moment: Moment, weight: Tensor) -> Tensor:
-    """h_t, shape (n, K), from the x_t and h_{t-1} that stand in the moment's signal.
+class Tape:
+    """All that the layers computed along their last T steps, and views of each step.
 
-    (i, f, g, o) = W [x, 1, h], with the logistic function on i, f and o and tanh on g; c' = f c + i g; h' = o tanh(c').
+    A tape as long as the episode holds what the gradient needs; one of two steps that turns in a circle is all that control needs.
     """
-    torch.mm(weight, moment.signal, out=moment.gates)
-    moment.logistic.sigmoid_()
-    moment.candidate.tanh_()
-    torch.mul(moment.forget, moment.cell_before, out=moment.cell).addcmul_(moment.entry, moment.candidate)
-    torch.tanh(moment.cell, out=moment.squashed)
-    return torch.mul(moment.exit, moment.squashed, out=moment.hidden)
+
+    def __init__(self, layers: Sequence[Layer], output: Tensor) -> None:
+        """The tape over this memory; `output` (T, n, K) is what the top layer hands up."""
+        self.layers, self.output = layers, output
+        outputs = [*(layer.inputs for layer in layers[1:]), output]
+        self.moments = list(zip(*map(Layer.moments, layers, outputs), strict=True))
+        self.parts: dict[tuple[int, int], Tape] = {}
+
+    @classmethod
+    def blank(cls, weights: Sequence[Tensor], n_trajectories: int, n_steps: int | None, used: "Tape | None" = None) -> "Tape":
+        """A tape at its start, hidden and cell states zero, for layers with these `stacked` weights; without `n_steps` a circle.
+
+        A used tape of the same shape is wound back instead: new memory costs as much time as filling it.
+        """
+        n_rows, n_steps = (2, 2) if n_steps is None else (n_steps + 1, n_steps)
+        if used is None or used.output.shape[::2] != (n_steps, n_trajectories) or used.output.dtype != weights[0].dtype:
+            layers = []
+            for weight in weights:
+                width = len(weight) // 4
+                shapes = (n_rows, weight.shape[1]), (n_steps, 4 * width), (n_rows, width), (n_steps, width)
+                layers.append(Layer(*(weight.new_empty(*shape, n_trajectories) for shape in shapes)))
+            used = cls(layers, torch.empty_like(layers[-1].squashed))
+        for layer in used.layers:
+            width = layer.cells.shape[1]
+            layer.signals[:, -1 - width] = 1
+            layer.signals[0, -width:] = 0
+            layer.cells[0] = 0
+        return used
+
+    def part(self, first: int, last: int) -> "Tape":
+        """The tape of some neighbouring trajectories, in the same memory."""
+        if (first, last) == (0, self.output.shape[-1]):
+            return self
+        if (first, last) not in self.parts:
+            layers = [Layer(*(entry[..., first:last] for entry in layer)) for layer in self.layers]
+            self.parts[first, last] = Tape(layers, self.output[..., first:last])
+        return self.parts[first, last]
+
+    def at(self, t: int) -> tuple[Moment, ...]:
+        """The views of step t, from the lowest layer upwards."""
+        return self.moments[t % len(self.moments)]
 
 
 def stacked(layer: nn.LSTM) -> Tensor:
     """The layer's parameters as one matrix on [x, 1, h], shape (4 n, n_in + 1 + n); torch's gates i, f, g, o as i, f, o, g."""
-    return stack(layer.all_weights[0])
-
-
-def stack(parameters: Sequence[Tensor]) -> Tensor:
-    """`stacked` for the four parameters of a layer in torch's order, or for changes of them."""
-    from_below, from_before, bias_below, bias_before = parameters
+    from_below, from_before, bias_below, bias_before = layer.all_weights[0]
     matrix = torch.cat([from_below, (bias_below + bias_before)[:, None], from_before], dim=1)
     entry, forget, candidate, exit_ = matrix.chunk(4)
     return torch.cat([entry, forget, exit_, candidate])
 
 
-class Unroll(torch.autograd.Function):
-    """h_0..h_{T-1}, shape (T, n, K), from x_0..x_{T-1}, shape (T, n_in, K): an LSTM layer with its gradient through time.
+def for_steps(weight: Tensor) -> Tensor:
+    """`stacked` weights as `step` takes them: with tanh(z) = 2 sigmoid(2 z) - 1 one logistic function serves all gates."""
+    doubled = weight.detach().clone()
+    doubled[-(len(weight) // 4) :] *= 2
+    return doubled
 
-    With the tape of a rollout under the same parameters (`recorded`) nothing is computed twice. Otherwise a tape at its start only
-    lends its memory. A tape serves for one gradient only.
+
+def step(moments: Sequence[Moment], weights: Sequence[Tensor], slope: float) -> Tensor:
+    """What the top layer hands up, shape (n, K), from x_t and every h_{t-1}, which stand in the moments' signals.
+
+    (i, f, g, o) = W [x, 1, h], with the logistic function on i, f and o and tanh on g; c' = f c + i g; h' = o tanh(c'). The
+    recurrence sees h', the layer above leaky_relu(h'). tanh is made of the logistic function, which takes a third of the time.
+
+    Args:
+        weights: of each layer, as from `for_steps`.
+    """
+    for moment, weight in zip(moments, weights, strict=True):
+        torch.mm(weight, moment.signal, out=moment.gates).sigmoid_()
+        torch.add(MINUS_ONE, moment.candidate, alpha=2, out=moment.candidate)
+        torch.mul(moment.forget, moment.cell_before, out=moment.cell).addcmul_(moment.entry, moment.candidate)
+        torch.mul(moment.cell, TWO, out=moment.squashed).sigmoid_()
+        torch.add(MINUS_ONE, moment.squashed, alpha=2, out=moment.squashed)
+        torch.mul(moment.exit, moment.squashed, out=moment.hidden)
+        leaky_relu(moment.hidden, slope, out=moment.output)
+    return moments[-1].output
+
+
+class Unroll(torch.autograd.Function):
+    """What the top layer hands up, shape (T, n, K), from the inputs that stand on a tape, with its gradient through time.
+
+    With the tape of a rollout under the same parameters (`recorded`) nothing is computed twice; another has to be at its start. A
+    tape serves for one gradient only.
     """
 
     @staticmethod
-    def forward(ctx: Any, inputs: Tensor, weight: Tensor, tape: Tape, recorded: bool) -> Tensor:
-        """The hidden states, from the tape if they are recorded there."""
+    def forward(ctx: Any, tape: Tape, recorded: bool, slope: float, *weights: Tensor) -> Tensor:
+        """The output of the tape, after going along it unless it is recorded there."""
         if not recorded:
-            tape.inputs.copy_(inputs)
-            for moment in tape.moments[: len(inputs)]:
-                step(moment, weight)
-        ctx.tape = tape
-        ctx.n_inputs = inputs.shape[1]
-        ctx.save_for_backward(weight)
-        return tape.hidden
+            doubled = [for_steps(weight) for weight in weights]
+            for moments in tape.moments:
+                step(moments, doubled, slope)
+        ctx.tape, ctx.slope = tape, slope
+        ctx.save_for_backward(*weights)
+        return tape.output[:]
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, None, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         """Backpropagation through time; `d_z` is the gradient of the loss in z. It spends the tape.
 
-        Step by step, so that what a step needs stays in the processor's cache, and the gradients in the gates before their
-        activation take the place of the gates.
+        Step by step and layer by layer, so that what a step needs stays in the processor's cache. The gradient in a signal takes
+        the signal's place: its parts are that in what the layer below handed up, and that in the hidden state one step before.
         """
-        (d_hidden,) = gradients
-        (weight,) = ctx.saved_tensors
-        tape = ctx.tape
-        width, n_steps = tape.cells.shape[1], len(tape.gates)
-        # Back through [x, h] or through h alone: the lowest layer's inputs need no gradient.
-        below = [weight[:, : ctx.n_inputs]] if ctx.needs_input_grad[0] else []
-        back = torch.cat([*below, weight[:, -width:]], dim=1).T.contiguous()
-        d_signals = weight.new_zeros(n_steps + 1, len(back), d_hidden.shape[-1])
-        d_recurrent = d_signals[:, -width:].unbind(0)
-        d_later = d_recurrent[n_steps]  # the part of d_h that comes from step t + 1
-        d_cell, d_squashed = torch.zeros_like(d_later), torch.empty_like(d_later)
-        d_weight = torch.zeros_like(weight)
-        d_gates = weight.new_empty(4 * width, d_later.shape[1])  # in the gates after their activation
-        d_entry, d_forget, d_exit, d_candidate = d_gates.split(width)
-        d_logistic = d_gates[: 3 * width]
-        steps = zip(tape.moments, d_hidden.unbind(0), d_signals.unbind(0), d_recurrent, strict=False)
-        for moment, d_now, d_signal, d_before in reversed(list(steps)[:n_steps]):
-            d_h = d_later.add_(d_now)
-            torch.mul(d_h, moment.exit, out=d_squashed)
-            d_cell += tanh_backward(d_squashed, moment.squashed, grad_input=d_squashed)
-            torch.mul(d_cell, moment.candidate, out=d_entry)
-            torch.mul(d_cell, moment.cell_before, out=d_forget)
-            torch.mul(d_h, moment.squashed, out=d_exit)
-            torch.mul(d_cell, moment.entry, out=d_candidate)
-            d_cell *= moment.forget
-            sigmoid_backward(d_logistic, moment.logistic, grad_input=moment.logistic)
-            tanh_backward(d_candidate, moment.candidate, grad_input=moment.candidate)
-            torch.mm(back, moment.gates, out=d_signal)
-            d_later = d_before
-            # The copy pays: a product is twice as fast where both matrices have their rows in a piece.
-            d_weight.addmm_(moment.gates, moment.signal.T.contiguous())
-        return d_signals[:-1, :-width] if ctx.needs_input_grad[0] else None, d_weight, None, None
+        backs = [weight.T.contiguous() for weight in ctx.saved_tensors]
+        d_weights = [torch.zeros_like(back) for back in backs]
+        scratch = []
+        for layer in ctx.tape.layers:
+            layer.signals[-1, -layer.cells.shape[1] :] = 0  # nothing comes from beyond the last step
+            d_gates = layer.gates.new_empty(layer.gates.shape[1:])  # in the gates after their activation
+            parts = d_gates.split(layer.cells.shape[1])
+            d_cell = torch.zeros_like(layer.cells[0])
+            scratch.append((d_gates, d_gates[: -len(d_cell)], *parts, d_cell, torch.empty_like(d_cell)))
+        work = list(zip(backs, d_weights, scratch, strict=True))
+        for moments, d_top in reversed(list(zip(ctx.tape.moments, gradients[0].unbind(0), strict=True))):
+            d_output = d_top
+            for moment, (back, d_weight, rest) in zip(reversed(moments), reversed(work), strict=True):
+                d_gates, d_logistic, d_entry, d_forget, d_exit, d_candidate, d_cell, d_h = rest
+                # tanh(c) has the sign of h = o tanh(c), whose own place is taken.
+                leaky_relu_backward(d_output, moment.squashed, ctx.slope, False, grad_input=d_h).add_(moment.hidden)
+                torch.mul(d_h, moment.exit, out=d_exit)
+                d_cell += tanh_backward(d_exit, moment.squashed, grad_input=d_exit)
+                torch.mul(d_cell, moment.candidate, out=d_entry)
+                torch.mul(d_cell, moment.cell_before, out=d_forget)
+                torch.mul(d_h, moment.squashed, out=d_exit)
+                torch.mul(d_cell, moment.entry, out=d_candidate)
+                d_cell *= moment.forget
+                sigmoid_backward(d_logistic, moment.logistic, grad_input=d_logistic)
+                tanh_backward(d_candidate, moment.candidate, grad_input=d_candidate)
+                d_weight.addmm_(moment.signal, d_gates.T)
+                torch.mm(back, d_gates, out=moment.signal)
+                d_output = moment.inputs
+        return None, None, None, *(d_weight.T for d_weight in d_weights)

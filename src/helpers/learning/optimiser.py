@@ -21,26 +21,17 @@ DEFAULTS: Any = {
 
 
 class Adam:
-    """The optimiser of Kingma and Ba (2015) by torch's own functional `adam`, at torch's defaults.
+    """The optimiser of Kingma and Ba (2015) by torch's own functional `adam`: the numbers of torch's class with `fused`."""
 
-    Its interface is the part of `torch.optim.Optimizer` that learning uses; its numbers are those of torch's class with `fused`.
-    """
-
-    def __init__(self, parameters: Iterable[nn.Parameter], lr: float) -> None:
+    def __init__(self, parameters: Iterable[nn.Parameter]) -> None:
         self.parameters = list(parameters)
-        self.param_groups: list[dict[str, Any]] = [{"lr": lr}]
         # First and second moment of the gradient, and the number of steps.
         self.state = [(torch.zeros_like(p.data), torch.zeros_like(p.data), torch.tensor(0.0)) for p in self.parameters]
 
-    def zero_grad(self) -> None:
-        """Forget the gradients."""
-        for parameter in self.parameters:
-            parameter.grad = None
-
     @torch.no_grad()
-    def step(self) -> None:
-        """Move the parameters against the gradients that they hold; one without a gradient stays."""
+    def step(self, rate: float) -> None:
+        """Move the parameters against the gradients that they hold, at this learning rate; one without a gradient stays."""
         held = [(p, p.grad, *state) for p, state in zip(self.parameters, self.state, strict=True) if p.grad is not None]
         if held:
             parameters, gradients, means, squares, counts = (list(column) for column in zip(*held, strict=True))
-            adam(parameters, gradients, means, squares, [], counts, lr=self.param_groups[0]["lr"], **DEFAULTS)
+            adam(parameters, gradients, means, squares, [], counts, lr=rate, **DEFAULTS)

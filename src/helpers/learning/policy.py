@@ -1,14 +1,13 @@
 """The LSTM policy of Section 3.2: its distribution over the inputs, and its fast stepping in closed loop."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from helpers.learning.lstm import Tape, Unroll, stacked, step
+from helpers.learning.lstm import Tape, Unroll, for_steps, stacked, step
 from helpers.plant.task import ControlTask
 from helpers.settings.paper import ExplorationParams, PolicyParams
 
@@ -82,13 +81,11 @@ class LSTMPolicy(nn.Module):
         """A fresh policy whose mean input is near u* = 0 and whose standard deviation is the initial one."""
         policy = cls(params, len(task.set_point), len(task.input_low)).to(task.set_point.dtype)
         with torch.no_grad():
-            for layer in policy.lstms:
-                bound = 1 / math.sqrt(layer.hidden_size)
-                for parameter in layer.parameters():
-                    parameter.copy_(torch.rand(parameter.shape, generator=generator, dtype=parameter.dtype) * 2 * bound - bound)
-            weight = policy.output.weight
-            bound = params.initial_output_scale / math.sqrt(weight.shape[1])
-            weight.copy_(torch.rand(weight.shape, generator=generator, dtype=weight.dtype) * 2 * bound - bound)
+            layers = [(layer, 1 / math.sqrt(layer.hidden_size)) for layer in policy.lstms]
+            bounds = [(parameter, bound) for layer, bound in layers for parameter in layer.parameters()]
+            top = params.initial_output_scale / math.sqrt(policy.output.in_features)
+            for parameter, bound in [*bounds, (policy.output.weight, top)]:
+                parameter.copy_(torch.rand(parameter.shape, generator=generator, dtype=parameter.dtype) * 2 * bound - bound)
             policy.output.bias[: policy.n_manipulated] = -RELU6_TOP * task.input_low / (task.input_high - task.input_low)
         policy.reset_exploration()
         return policy
@@ -115,48 +112,38 @@ class LSTMPolicy(nn.Module):
             factor=torch.cat([span, (params.std_high - params.std_low) * span]) / RELU6_TOP,
         )
 
-    def network_inputs(self, y: Tensor, u_previous: Tensor, task: ControlTask) -> Tensor:
-        """What the network sees, shape (..., n_y + n_u), from observations and the inputs applied one sample before."""
-        return self.scaling(task).inputs(y, u_previous)
-
-    def scale(self, output: Tensor, task: ControlTask) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the inputs, each (..., n_u), from the output layer before its activation."""
-        return self.scaling(task).outputs(output)
+    def network_inputs(self, y: Tensor, u: Tensor, task: ControlTask) -> Tensor:
+        """What the network sees along trajectories as of `forward`, shape (T, K, n_y + n_u); at first the input is u* = 0."""
+        return self.scaling(task).inputs(y[: len(u)], torch.cat([torch.zeros_like(u[:1]), u[:-1]]))
 
     def forward(self, y: Tensor, u: Tensor, task: ControlTask) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of u_0..u_{T-1} along recorded trajectories, each (T, K, n_u).
 
         Args:
             y: observations y_0..y_{T-1} (a y_T is ignored), shape (T or T + 1, K, n_y).
-            u: applied inputs u_0..u_{T-1}, shape (T, K, n_u). Before the first sample the input is u* = 0.
+            u: applied inputs u_0..u_{T-1}, shape (T, K, n_u).
         """
-        previous = torch.cat([torch.zeros_like(u[:1]), u[:-1]])
-        signal = self.network_inputs(y[: len(u)], previous, task)
+        signal = self.network_inputs(y, u, task)
         for layer in self.lstms:
             signal = functional.leaky_relu(layer(signal)[0], self.params.leaky_slope)
-        return self.scale(self.output(signal), task)
+        return self.scaling(task).outputs(self.output(signal))
 
     def unrolled(
-        self, y: Tensor, u: Tensor, task: ControlTask, tapes: Sequence[Tape] = (), recorded: bool = False
+        self, y: Tensor, u: Tensor, task: ControlTask, tape: Tape | None = None, recorded: bool = False
     ) -> tuple[Tensor, Tensor]:
         """What `forward` gives, faster.
 
-        Tapes of these trajectories lend their memory. With `recorded` they hold what a controller with these parameters computed
+        A tape of these trajectories lends its memory. With `recorded` it holds what a controller with these parameters computed
         along the trajectories, and that is not computed again.
         """
         weights = [stacked(layer) for layer in self.lstms]
-        if recorded:
-            signal = tapes[0].inputs
-        else:
-            previous = torch.cat([torch.zeros_like(u[:1]), u[:-1]])
-            signal = self.network_inputs(y[: len(u)], previous, task).mT
-            lent: Sequence[Tape | None] = tapes or [None] * len(weights)
-            tapes = [Tape.blank(len(u), weight.detach(), u.shape[1], old) for weight, old in zip(weights, lent, strict=True)]
-        for weight, tape in zip(weights, tapes, strict=True):
-            signal = functional.leaky_relu(Unroll.apply(signal, weight, tape, recorded), self.params.leaky_slope)
+        if tape is None or not recorded:
+            tape = Tape.blank(weights, u.shape[1], len(u), tape)
+            tape.layers[0].inputs[:-1] = self.network_inputs(y, u, task).mT
+        signal = Unroll.apply(tape, recorded, self.params.leaky_slope, *weights)
         # A batch of products: `@` would copy the signal of all steps to make one product of them.
         output = torch.baddbmm(self.output.bias[:, None], self.output.weight.expand(len(signal), -1, -1), signal)
-        return self.scale(output.mT, task)
+        return self.scaling(task).outputs(output.mT)
 
     def log_probability(self, y: Tensor, u: Tensor, command: Tensor, task: ControlTask) -> Tensor:
         """ln pi(command_t | y_0..y_t, u_0..u_{t-1}), shape (T, K): the term of Eq. 3.2.3.
@@ -171,7 +158,7 @@ class PolicyMemory:
     """What every layer computed so far, and the exploration noise of every step; features first."""
 
     step: int
-    tapes: list[Tape]
+    tape: Tape
     seen: Tensor  # the present observation above the input before it, shape (n_y + n_u, K)
     observed: Tensor  # the two parts of `seen`
     applied: Tensor
@@ -182,46 +169,40 @@ class PolicyController:
     """A policy in closed loop: the same mathematics as `LSTMPolicy.forward`, one step at a time, without gradients.
 
     `exploring` draws from the distribution; without it the mode is used, as on deployment. `recording` keeps what the
-    layers computed in `tapes`, for the gradient, writing over used tapes where there are any. The parameters are those of
+    layers computed in `tape`, for the gradient, writing over a used tape where there is one. The parameters are those of
     the policy when the controller was made.
     """
 
     def __init__(
-        self, policy: LSTMPolicy, task: ControlTask, exploring: bool, recording: bool = False, used: Sequence[Tape] = ()
+        self, policy: LSTMPolicy, task: ControlTask, exploring: bool, recording: bool = False, used: Tape | None = None
     ) -> None:
         self.policy = policy
         self.task = task
         self.exploring = exploring
         self.recording = recording
         with torch.no_grad():
-            self.layers = [stacked(layer) for layer in policy.lstms]
+            self.layers = [for_steps(stacked(layer)) for layer in policy.lstms]
             self.output_weight, self.output_bias = policy.output.weight.clone(), policy.output.bias[:, None].clone()
-        self.tapes = list(used)
+        self.tape = used
         self.scaling = policy.scaling(task).features_first()
         self.low, self.high = task.input_low[:, None], task.input_high[:, None]
 
     def start(self, n_trajectories: int, n_steps: int, generator: torch.Generator) -> PolicyMemory:
         """Zero hidden states, the input at u* = 0, and all exploration noise drawn at once."""
         like, n_inputs = self.output_weight, self.policy.n_manipulated
-        used: Sequence[Tape | None] = self.tapes or [None] * len(self.layers)
-        length = n_steps if self.recording else 1
-        tapes = [Tape.blank(length, weight, n_trajectories, old) for weight, old in zip(self.layers, used, strict=True)]
-        self.tapes = tapes if self.recording else []
+        tape = Tape.blank(self.layers, n_trajectories, n_steps if self.recording else None, self.tape)
+        self.tape = tape if self.recording else None
         shape = (n_steps, n_inputs, n_trajectories)
         noise = torch.randn(shape, generator=generator, dtype=like.dtype).unbind(0) if self.exploring else ()
         seen = like.new_zeros(len(self.scaling.centre), n_trajectories)
-        return PolicyMemory(0, tapes, seen, seen[:-n_inputs], seen[-n_inputs:], noise)
+        return PolicyMemory(0, tape, seen, seen[:-n_inputs], seen[-n_inputs:], noise)
 
     def act(self, observation: Tensor, memory: PolicyMemory) -> tuple[Tensor, PolicyMemory]:
         """The policy's command for one sample; the memory is updated in place."""
         memory.observed.copy_(observation.T)
-        moments = [tape.at(memory.step) for tape in memory.tapes]
+        moments = memory.tape.at(memory.step)
         torch.sub(memory.seen, self.scaling.centre, out=moments[0].inputs).mul_(self.scaling.gain)
-        for layer, (moment, weight) in enumerate(zip(moments, self.layers, strict=True)):
-            signal = functional.leaky_relu(step(moment, weight), self.policy.params.leaky_slope)
-            if layer + 1 < len(moments):
-                moments[layer + 1].inputs.copy_(signal)
-        output = torch.addmm(self.output_bias, self.output_weight, signal)
+        output = torch.addmm(self.output_bias, self.output_weight, step(moments, self.layers, self.policy.params.leaky_slope))
         mean, std = torch.addcmul(self.scaling.shift, functional.relu6(output), self.scaling.factor).chunk(2)
         command = torch.addcmul(mean, std, memory.exploration[memory.step]) if memory.exploration else mean
         torch.clamp(command, self.low, self.high, out=memory.applied)

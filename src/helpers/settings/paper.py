@@ -154,7 +154,6 @@ class LearnerParams(Record):
     averaging: Annotated[Memory, Leaf("-")]
     patience: Annotated[int, Strict(), Field(ge=0), Leaf("epochs")]
     entropy: Annotated[NotNegative, Leaf("-")] = 0.0
-    trust_region: Annotated[Positive, Leaf("nats")] | None = None
 
 
 class WeightParams(Record):
@@ -199,7 +198,6 @@ class TrialParams(Record):
         "kept policy",
         "entropy",
         "clipped ratio",
-        "natural gradient",
         "exploration",
         "credit",
     ]

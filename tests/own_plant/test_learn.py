@@ -42,10 +42,11 @@ FILES = {
 
 def small(plant):
     """A few epochs and steps with a few episodes: enough to see that everything fits together."""
-    learning = plant.learning.model_copy(update={"policy": plant.learning.policy.model_copy(update={"hidden_cells": (6, 6)})})
+    learning = plant.base.learning
+    learning = learning.model_copy(update={"policy": learning.policy.model_copy(update={"hidden_cells": (6, 6)})})
     scale = plant.scale.model_copy(update={"episodes": 16, "measured": 4, "epoch_share": 0.02})
     parts = {name: getattr(plant.params, name).model_copy(update=changes) for name, changes in QUICK.items()}
-    return replace(plant, scale=scale, learning=learning, params=plant.params.model_copy(update=parts))
+    return replace(plant, scale=scale, base=replace(plant.base, learning=learning), params=plant.params.model_copy(update=parts))
 
 
 @pytest.fixture
@@ -68,7 +69,7 @@ def test_the_whole_chain_runs_for_any_number_of_variables(n_y, n_u, tmp_path, ro
     identified, validation = learn.identify_plant(plant)
     assert (validation.fit > 0.5).all()
     model = identified.nominal.to(plant.dtype)
-    offline = learn.learn_offline(plant, model, learn.task_on(plant, model))
+    _, offline = learn.learn_offline(plant, model, learn.task_on(plant, model))
     assert len(offline.records) == 6
     assert offline.weights.shape == (3 * n_y,)
     workshop = learn.open_workshop(plant, identified)
@@ -89,7 +90,7 @@ def test_the_whole_chain_runs_for_any_number_of_variables(n_y, n_u, tmp_path, ro
 def test_the_features_are_those_of_the_record_and_on_y(tmp_path, root):
     plant = learn.open_plant(MadeUpPlant(2, 2).write(tmp_path), root, "smoke", 0)
     found, task = plant.demonstrations, plant.task(torch.zeros(2), torch.zeros(2))
-    features = plant.features(task)
+    features = plant.study(None, task).features
     assert features.params.features_on == "y"
     assert found.trajectories.y.shape[0] == HORIZON + 1
     errors = (task.set_point - found.trajectories.y[1:]) / task.error_scale

@@ -1,10 +1,7 @@
-"""From a historian file to a policy: read, identify, learn offline, improve online, transfer, compare.
-
-The learning is that of the paper's plant; what differs is that a plant shows y alone, so that the features are on y.
-"""
+"""From a historian file to a policy for the range of the record: read, identify, tune the rivals, learn, pass the gate."""
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +11,8 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from helpers.learning.algorithm_2 import Apprenticeship, algorithm_2, initial_weights
-from helpers.learning.features import FeatureMap, feature_names
-from helpers.learning.learner import Learner
+from helpers.learning.algorithm_2 import Apprenticeship
 from helpers.learning.model_gradient import Descent, GradientRecord, model_gradient
-from helpers.learning.policy import LSTMPolicy
 from helpers.learning.tracking_policy import Gains, TrackingPolicy, VelocityPID
 from helpers.own_plant.description import PlantDescription, load_description
 from helpers.own_plant.episodes import Episodes, episodes, stretches
@@ -35,23 +29,27 @@ from helpers.plant.rollout import stream
 from helpers.plant.task import ControlTask
 from helpers.plant.tracking import Scenarios, Tracked, Tracker, track
 from helpers.runs.progress import ProgressBar
+from helpers.runs.study import Demonstrations, Study
 from helpers.settings.leaf import InputError
-from helpers.settings.paper import FeatureParams, LearningParams, Params, ScaleParams, load
+from helpers.settings.paper import Params, ScaleParams, load
 
 PIECE = 5  # episodes: how long the pieces of a long record are that the model is identified from
-VARIANT = "improved"  # of Algorithms 1 and 2
 HELD, FEWEST = 2.0, 0.1  # |e| in units of the range that a loop which is held never exceeds; least share of such models
+HARM = 4.0  # how many times more an error counts that goes beyond that of the record's PID
 SLACK, BEYOND = 0.95, 10.0  # share of the allowed movement that is aimed at, and the price of more while the rivals are tuned
 
 
 @dataclass(frozen=True)
 class OwnPlant:
-    """A plant, its clean record, its demonstrations of one task, and how to learn from them."""
+    """A plant, its clean record, its demonstrations of one task, and how to learn from them.
+
+    Attributes:
+        params: of params/own_plant.yaml. base: of the paper's learning, which is used as it is. scale: how much is computed.
+    """
 
     description: PlantDescription
     params: OwnPlantParams
-    learning: LearningParams
-    feature_params: FeatureParams
+    base: Params
     scale: ScaleParams
     seed: int
     clean: CleanRecords
@@ -72,18 +70,9 @@ class OwnPlant:
         """Names of the manipulated variables."""
         return tuple(variable.name for variable in self.description.manipulated)
 
-    @property
-    def feature_names(self) -> list[str]:
-        """Names of the features in their order."""
-        return feature_names(self.controlled)
-
     def task(self, initial_mean: Tensor, initial_std: Tensor) -> ControlTask:
         """The control task, for a process whose first state is distributed so."""
         return self.description.task(initial_mean, initial_std, self.dtype)
-
-    def features(self, task: ControlTask) -> FeatureMap:
-        """The features, on y."""
-        return FeatureMap(self.feature_params, task, self.description.sampling_time)
 
     def epochs(self, full: int) -> int:
         """How many of the full number of epochs this scale runs."""
@@ -93,17 +82,19 @@ class OwnPlant:
         """The random stream for one purpose."""
         return stream(self.seed, "own plant", *purpose)
 
-    def fresh_policy(self, task: ControlTask) -> LSTMPolicy:
-        """An untrained policy."""
-        unit = tuple((self.params.learning.error_unit * task.error_scale.abs()).tolist())
-        return LSTMPolicy.initial(self.learning.policy.model_copy(update={"error_unit": unit}), task, self.stream("policy"))
-
-    def with_set_points(self, set_points: Mapping[str, float]) -> "OwnPlant":
-        """The same plant and record with the task and the demonstrations of other set points."""
-        description = self.description.with_set_points(dict(set_points))
-        return replace(
-            self, description=description, demonstrations=episodes(self.clean, description, self.params.quality, self.dtype)
+    def study(self, process: Process, task: ControlTask) -> Study:
+        """The paper's offline learning on whatever stands for the plant, with the features on y, the one signal that it shows."""
+        base, own = self.base, self.params.learning
+        unit = tuple((own.error_unit * task.error_scale.abs()).tolist())
+        names = {"controlled": self.controlled, "manipulated": self.manipulated, "sampling_time": self.description.sampling_time}
+        params = replace(
+            base,
+            process=base.process.model_copy(update=names),
+            features=base.features.model_copy(update={"features_on": "y"}),
+            learning=base.learning.model_copy(update={"policy": base.learning.policy.model_copy(update={"error_unit": unit})}),
+            case=base.case.model_copy(update={"offline": base.case.offline.model_copy(update={"epochs": own.offline_epochs})}),
         )
+        return Study(params=params, scale_params=self.scale, seed=self.seed, case="own plant", own=(process, task))
 
 
 def open_plant(path: Path, params_root: Path, scale: str, seed: int, params: Params | None = None) -> OwnPlant:
@@ -113,20 +104,11 @@ def open_plant(path: Path, params_root: Path, scale: str, seed: int, params: Par
         InputError: in one sentence, if the files cannot be used.
     """
     description, own = load_description(path), load_own_plant(params_root)
-    params = params or load(params_root, 1)
-    records = read_records(path.parent / description.data, description)
-    clean = examine(records, description, own.quality)
-    scale_params = params.learning.scales[scale]
-    return OwnPlant(
-        description=description,
-        params=own,
-        learning=params.learning,
-        feature_params=params.features.model_copy(update={"features_on": "y"}),
-        scale=scale_params,
-        seed=seed,
-        clean=clean,
-        demonstrations=episodes(clean, description, own.quality, getattr(torch, scale_params.number_type)),
-    )
+    base = params or load(params_root, 1)
+    clean = examine(read_records(path.parent / description.data, description), description, own.quality)
+    scale_params = base.learning.scales[scale]
+    found = episodes(clean, description, own.quality, getattr(torch, scale_params.number_type))
+    return OwnPlant(description, own, base, scale_params, seed, clean, found)
 
 
 def identify_plant(plant: OwnPlant) -> tuple[Identified, Validation]:
@@ -158,16 +140,10 @@ def task_on(plant: OwnPlant, model: ArmaxModel) -> ControlTask:
     return plant.task(torch.cat(means), torch.cat(stds))
 
 
-def learn_offline(plant: OwnPlant, process: Process, task: ControlTask) -> Apprenticeship:
+def learn_offline(plant: OwnPlant, process: Process, task: ControlTask) -> tuple[Study, Apprenticeship]:
     """Algorithm 2 on whatever stands for the plant: what the record's controller was after, as weights, and a policy like it."""
-    variant, scale = plant.learning.variants[VARIANT], plant.scale
-    n_epochs = plant.epochs(plant.params.learning.offline_epochs)
-    weights = initial_weights(variant.weights, len(plant.controlled), plant.dtype)
-    policy, features = plant.fresh_policy(task), plant.features(task)
-    policy.reset_exploration(variant.exploration)
-    learner = Learner(policy, process, features, variant.learner, scale.episodes, n_epochs, plant.stream("offline"))
-    expert = features.trajectory(plant.demonstrations.trajectories).mean(0)
-    return algorithm_2(learner, expert, weights, variant.weights, n_epochs, scale.measured, ProgressBar(n_epochs, "offline"))
+    study = plant.study(process, task)
+    return study, study.imitate(Demonstrations(plant.demonstrations.trajectories, pd.Series(dtype=float)), study.fresh_policy())
 
 
 @dataclass(frozen=True)
@@ -268,14 +244,15 @@ def learn_policy(
         int(torch.randint(2**31, (1,), generator=generator))
     )  # torch.nn draws the first weights from the global stream
     policy = (
-        TrackingPolicy(plant.learning.policy, start, operation.unit, operation.centre, operation.unit, operation.bounds)
+        TrackingPolicy(plant.base.learning.policy, start, operation.unit, operation.centre, operation.unit, operation.bounds)
         if isinstance(start, Gains)
         else copy.deepcopy(start)
     )
 
     def measure(scenarios: Scenarios, run: Tracked) -> tuple[Tensor, Tensor]:
         error, movement = workshop.reference(scenarios)
-        return operation.error(run) / error, operation.movement(run) / movement / params.movement
+        share = operation.error(run) / error
+        return share + HARM * (share - 1).clamp(min=0), operation.movement(run) / movement / params.movement
 
     descent = Descent(plant.epochs(params.steps))
     records = model_gradient(
@@ -306,13 +283,3 @@ def parameter_table(plant: OwnPlant, identified: Identified) -> pd.DataFrame:
             row |= {f"dead time of {entry}": structure.dead_times[j], f"{kind} of {entry}": equation.inputs[j].sum() / free}
         rows[name] = row | {"noise": equation.spread[0], "noise, share of y": equation.spread[1]}
     return pd.DataFrame(rows).T
-
-
-def history(records: Sequence[Any], names: Sequence[str]) -> pd.DataFrame:
-    """Records of learning as a table; the weights become one column a feature, `alpha:<feature>`."""
-    rows = []
-    for record in records:
-        row = dict(vars(record))
-        weights = row.pop("weights", ())
-        rows.append(row | {f"alpha:{name}": value for name, value in zip(names, weights, strict=False)})
-    return pd.DataFrame(rows)

@@ -22,7 +22,6 @@ from helpers.own_plant.gate import POLICY, PREDICTIVE, RECORD, TUNED
 from helpers.own_plant.learn import (
     OwnPlant,
     Workshop,
-    history,
     identify_plant,
     learn_offline,
     learn_policy,
@@ -102,11 +101,11 @@ def offline(plant: OwnPlant, workshop: Workshop) -> tuple[dict[str, pd.DataFrame
     """What the record's controller was after, by Algorithm 2: the table of its weights, and a sentence."""
     model = workshop.nominal.to(plant.dtype)
     try:
-        found = learn_offline(plant, model, task_on(plant, model))
+        study, found = learn_offline(plant, model, task_on(plant, model))
     except TrainingError as error:
         return {}, f"the weights of the record's controller were not found: {error}"
-    weights = pd.DataFrame({"alpha*": found.weights.tolist()}, index=plant.feature_names)
-    gap = history(found.records, plant.feature_names)["feature_gap"].min()
+    weights = pd.DataFrame({"alpha*": found.weights.tolist()}, index=study.feature_names)
+    gap = min(record.feature_gap for record in found.records)
     return {"Reward weights": weights}, f"Algorithm 2 matches the features of the record to {100 * gap:.1f} %"
 
 

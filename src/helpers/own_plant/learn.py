@@ -35,7 +35,7 @@ from helpers.settings.paper import Params, ScaleParams, load
 
 PIECE = 5  # episodes: how long the pieces of a long record are that the model is identified from
 HELD, FEWEST = 2.0, 0.1  # |e| in units of the range that a loop which is held never exceeds; least share of such models
-HARM = 4.0  # how many times more an error counts that goes beyond that of the record's PID
+HARM = 8.0  # how many times more an error counts that goes beyond that of the record's PID
 SLACK, BEYOND = 0.95, 10.0  # share of the allowed movement that is aimed at, and the price of more while the rivals are tuned
 
 

@@ -63,56 +63,43 @@ def tuned_pid(
 ) -> Gains:
     """The PID of the record with its gains re-tuned on all models at once, from several starts, by CMA-ES (Hansen 2016).
 
-    The starts are the record's gains, those with a third of the integral action, and those of the SIMC rule for each loop.
+    The starts are the record's gains, those with a third of the integral action, and those of the SIMC rule for each loop. What is
+    searched are factors of the gains that are not zero.
     """
-    places = torch.nonzero(record.integral.abs() + record.proportional.abs() > 0).tolist()
-    kinds = [kind for kind in ("proportional", "integral", "derivative") if getattr(record, kind).abs().sum() > 0]
+    given = torch.stack([record.proportional, record.integral, record.derivative])
+    slow, textbook = given.clone(), given.clone()
+    slow[1] /= 3
     response = step_response(nominal.to(torch.float64), params.response)
+    for j, i in torch.nonzero(given[1]).tolist():
+        rule = torch.tensor(simc(response[j, :, i]), dtype=given.dtype)
+        if rule.isfinite().all() and rule[1] * given[1, j, i] > 0:
+            textbook[:2, j, i] = rule
+    n_episodes = len(scenarios.start)
 
-    def base(rule: str) -> dict[str, Tensor]:
-        found = {kind: getattr(record, kind).clone() for kind in ("proportional", "integral", "derivative")}
-        for j, i in places:
-            gain, integral = simc(response[j, :, i]) if rule == "simc" else (found["proportional"][j, i], found["integral"][j, i])
-            if np.isfinite(float(gain)) and float(gain) * float(found["integral"][j, i]) >= 0:
-                found["proportional"][j, i], found["integral"][j, i] = gain, integral * (1 / 3 if rule == "slow" else 1)
-        return found
+    def gains(start: Tensor, logs: Tensor) -> Tensor:
+        """Gains of many candidates, (n, 3, n_u, n_y)."""
+        many = start.repeat(len(logs), 1, 1, 1)
+        many[:, start != 0] *= logs.exp()
+        return many
 
-    def gains(start: dict[str, Tensor], logs: Tensor) -> Gains:
-        """Gains of many candidates, each (n, n_u, n_y), from the logarithms of their factors (n, kinds x places)."""
-        factors = logs.exp().reshape(len(logs), len(kinds), len(places))
-        found = {kind: value.expand(len(logs), -1, -1).clone() for kind, value in start.items()}
-        for row, kind in enumerate(kinds):
-            for column, (j, i) in enumerate(places):
-                found[kind][:, j, i] *= factors[:, row, column]
-        return Gains(**found)
-
-    def costs(start: dict[str, Tensor], logs: Tensor) -> list[float]:
-        n_episodes = scenarios.start.shape[0]
-        many = gains(start, logs)
-        spread = Gains(*(value.repeat_interleave(n_episodes, dim=0) for value in vars(many).values()))
+    def costs(start: Tensor, logs: Tensor) -> list[float]:
+        spread = Gains(*gains(start, logs).repeat_interleave(n_episodes, dim=0).unbind(1))
         with torch.no_grad():
             run = track(VelocityPID(spread), side_by_side(scenarios, len(logs)), operation.bounds)
         shape = (len(logs), n_episodes)
         value = price(operation.error(run).reshape(shape), operation.movement(run).reshape(shape))
-        return [float(v) if np.isfinite(float(v)) else 1e9 for v in value]
+        return list(value.nan_to_num(1e9).clamp(max=1e9).tolist())
 
-    best: tuple[float, Gains] | None = None
-    dtype = record.integral.dtype
-    for number, rule in enumerate(("record", "slow", "simc")):
-        start = base(rule)
-        options = {"seed": seed + number + 1, "verbose": -9, "maxiter": params.generations, "popsize": params.population}
-        search = cma.CMAEvolutionStrategy([0.0] * (len(kinds) * len(places)), 0.4, options)
+    found: list[tuple[float, Tensor]] = []
+    for number, start in enumerate((given, slow, textbook), 1):
+        options = {"seed": seed + number, "verbose": -9, "maxiter": params.generations, "popsize": params.population}
+        search = cma.CMAEvolutionStrategy([0.0] * int((start != 0).sum()), 0.4, options)
         while not search.stop():
             asked = search.ask()
-            search.tell(asked, costs(start, torch.tensor(np.array(asked), dtype=dtype)))
-        found = torch.tensor(search.result.xbest, dtype=dtype)[None]
-        for logs in (found, torch.zeros_like(found)):
-            value = costs(start, logs)[0]
-            if best is None or value < best[0]:
-                chosen = gains(start, logs)
-                best = (value, Gains(chosen.proportional[0], chosen.integral[0], chosen.derivative[0]))
-    assert best is not None
-    return best[1]
+            search.tell(asked, costs(start, torch.tensor(np.array(asked), dtype=given.dtype)))
+        best = torch.tensor(search.result.xbest, dtype=given.dtype)[None]
+        found += [(costs(start, logs)[0], gains(start, logs)[0]) for logs in (best, torch.zeros_like(best))]
+    return Gains(*min(found, key=lambda pair: pair[0])[1])
 
 
 class PredictiveControl:

@@ -117,6 +117,41 @@ def test_a_frozen_sensor_and_a_spike_are_found(clean, plant):
     assert found(after, "of no use").count == 30
 
 
+def moved_by_hand(tau, noise, digit, hold, seed=0, n_samples=3000):
+    """Rows of one output under PI control with set point steps, and moves by hand that last `hold` samples; no spike in it."""
+    rng = np.random.default_rng(seed)
+    x = integral = target = u = 0.0
+    delayed, rows = [0.0, 0.0], []
+    for t in range(n_samples):
+        target = rng.uniform(-10, 10) if t % 200 == 0 else target
+        y = digit * np.round((x + noise * rng.normal()) / digit)
+        integral += 0.1 / tau * (target - y)
+        if t % 200 < 180:
+            u = 0.3 * (target - y) + integral
+        elif t % hold == 0:
+            u = integral + rng.uniform(-8, 8)
+        delayed = [u, *delayed[:-1]]
+        x += (1 - np.exp(-1 / tau)) * (delayed[-1] - x)
+        rows.append([50 + y, 50 + target, 50 + u])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(
+    ("tau", "noise", "digit", "hold"),
+    [(0.3, 0.01, 1e-3, 1), (0.3, 0.01, 1e-3, 3), (2, 0.02, 1e-3, 4), (5, 0.002, 1e-3, 10), (2, 0.05, 0.5, 4), (8, 0.2, 0.1, 20)],
+)
+def test_good_samples_are_no_outliers_and_spikes_are_found_in_moves_by_hand_too(plant, clean, tau, noise, digit, hold):
+    rows = moved_by_hand(tau, noise, digit, hold)
+    single = {key: [plant.content[key][0] | {"low": -50.0, "high": 150.0}] for key in ("controlled", "manipulated")}
+    table = pd.DataFrame(rows, columns=["Y0.PV", "Y0.SP", "U0.OP"]).assign(TIME=2.0 * np.arange(len(rows)), MODE="AUTO")
+    assert not [entry for entry in clean(table, **single, pid=[]).findings if entry.check == "outlier"]
+    struck = [150, 790, 1230, 1333, 1334, 1750, 2221, 2650]  # of which two lie side by side
+    table.loc[struck, "Y0.PV"] += 80
+    after = clean(table, **single, pid=[])
+    assert found(after, "outlier").count == len(struck)
+    assert after.table["segment"].eq(0).all()  # and no coarse signal is taken for a frozen one
+
+
 def test_inputs_at_bounds_and_manual_rows_are_counted_and_kept(clean, plant):
     table = plant.table.copy()
     table.loc[10:14, "U0.OP"] = plant.steady_u[0] + 3

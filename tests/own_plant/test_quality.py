@@ -192,7 +192,15 @@ def test_what_no_rule_can_help_is_refused(clean, plant, tmp_path):
     assert "too little excitation" in refusal(clean, plant.table.assign(**{"U0.OP": 20.0}))
     moved = plant.table.assign(**{"U1.OP": plant.table["U0.OP"] - plant.steady_u[0] + plant.steady_u[1]})
     assert "move as one" in refusal(clean, moved)
-    assert "'sampling_time' is 1 s" in refusal(clean, plant.table, sampling_time=1.0)
+    for apart in (1.0, 0.02, 20.0, 200.0):
+        said = f"rows are 2 s apart, but 'sampling_time' is {apart:g} s: the one or the other, or 'time_unit', is wrong"
+        assert said in refusal(clean, plant.table, sampling_time=apart)
+    stamps = pd.Timestamp("2026-03-01") + pd.to_timedelta(plant.table["TIME"], unit="s")
+    sentence = refusal(clean, plant.table.assign(TIME=stamps), time_unit="min")
+    assert "rows are 0.0333333 min apart, but 'sampling_time' is 2 min: " in sentence
+    assert "'TIME': the time of all rows is the same" in refusal(clean, plant.table.assign(TIME=5.0))
+    coarse = refusal(clean, plant.table.assign(TIME=60.0 * (plant.table["TIME"] // 60)), sampling_time=60.0)
+    assert "97 % of the rows have the time of another one, the first is row 2" in coarse
     late = 0.9 * np.random.default_rng(0).integers(0, 2, len(plant.table))
     assert "between two samples" in refusal(clean, plant.table.assign(TIME=plant.table["TIME"] + late))
     assert "no time in rows 2, 3" in refusal(clean, plant.table.assign(TIME="yesterday"))

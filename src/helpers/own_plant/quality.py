@@ -15,6 +15,7 @@ from helpers.own_plant.settings import QualityParams
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 AT_BOUND = 1e-3  # of the range: as near to a bound as a rounded number may lie
+MOST = 0.5  # share of rows with a time of their own: of two exports in one file half
 COARSE = 1 / 3  # share of values that equal the one before, above which a signal is coarse
 BY_CHANCE = 0.01  # runs of equal values that a record may hold by chance and that are taken for a frozen sensor
 TINY = 1e-9
@@ -107,14 +108,22 @@ def _regular(records: Records, description: PlantDescription, params: QualityPar
     table, path, time = records.table, records.path, description.time
     row, clock = table["row"].to_numpy(), table["clock"].to_numpy()
     step = np.diff(clock)
-    typical = float(np.median(step[step > 0.5])) if (step > 0.5).any() else 1.0
+    if not (step > 0).any():
+        raise PlantDataError(f"{path}: column '{time}': the time of all rows is the same")
+    typical = float(np.median(step[step > 0]))
     if abs(typical - 1) > 0.02:
+        unit, dt = description.time_unit, description.sampling_time
         raise PlantDataError(
-            f"{path}: column '{time}': rows are {typical * description.sampling_time:g} {description.time_unit} apart, "
-            f"but 'sampling_time' is {description.sampling_time:g} {description.time_unit}"
+            f"{path}: column '{time}': rows are {typical * dt:g} {unit} apart, but 'sampling_time' is {dt:g} {unit}: "
+            f"the one or the other, or 'time_unit', is wrong"
         )
     samples = np.rint(step)
     keep = np.append(samples > 0, True)  # of rows with the same time the last one counts
+    if keep.mean() < MOST:
+        raise PlantDataError(
+            f"{path}: column '{time}': {100 * (1 - keep.mean()):.0f} % of the rows have the time of another one, the first is "
+            f"{name_rows(row[~keep][:1])}; export the record with a finer time"
+        )
     found += finding("doubled row", time, row[~keep], "the last one kept")
     row, clock = row[keep], clock[keep]
     step = np.diff(clock)

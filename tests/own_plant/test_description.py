@@ -44,6 +44,12 @@ def test_the_committed_description_gives_the_task_of_case_study_one_with_its_own
     [
         (changed("sampling_time", value=0.0), ["'sampling_time'", "greater than 0"]),
         (changed("horizon", value=12.5), ["'horizon'", "integer"]),
+        (changed("sampling_time", value=1e308), ["'sampling_time'", "less than or equal to 1000000"]),
+        (changed("horizon", value=10**12), ["'horizon'", "less than or equal to 100000"]),
+        (changed("separator", value="::"), ["'separator'"]),
+        (changed("decimal", value=";"), ["'decimal'"]),
+        (changed("encoding", value="klingon"), ["'encoding'", "latin-1"]),
+        (changed("encoding", value="rot13"), ["'encoding'"]),
         (changed("colour", value="red"), ["'colour'", "unknown"]),
         (changed("controlled", 0, "low", value=100.0), ["'controlled.0'", "'low' must lie below 'high'"]),
         (changed("controlled", 1, "steady_state", value=-3.0), ["'controlled.1'", "'steady_state' lies outside"]),

@@ -70,6 +70,39 @@ def test_too_few_episodes_are_refused_with_the_reasons(cut):
         cut(plant, plant.table[(plant.table.index % HOLD < 5) | (plant.table.index % HOLD > 14)])
 
 
+def loop(plant, **changes):
+    return [{key: value for key, value in (plant.content["controlled"][0] | changes).items() if value is not None}]
+
+
+def test_a_record_that_never_comes_near_the_task_is_refused_with_the_range_that_it_has(cut):
+    plant = MadeUpPlant(1, 1, CYCLES)
+    low, high = (f"{value:g}" for value in (plant.steady_y[0], plant.steady_y[0] + plant.set_point[0]))
+    found = (
+        rf"plant\.csv: column 'Y0\.SP': the set points lie between {low} and {high}, none is .* 80 %: change 'set_point' of 'y0'"
+    )
+    with pytest.raises(InputError, match=found):
+        cut(plant, controlled=loop(plant, set_point=80.0))
+    with pytest.raises(
+        InputError, match=r"plant\.csv: column 'Y0\.PV': lies between 49.* never near the set point, .* 80 %: change"
+    ):
+        cut(plant, controlled=loop(plant, set_point=80.0, set_point_tag=None))
+    with pytest.raises(InputError, match=rf"0 episodes .* left out: .* {CYCLES} not from 'steady_state'"):
+        cut(plant, controlled=loop(plant, steady_state=40.0))
+
+
+def test_a_record_whose_set_point_never_moves_gives_stretches_or_says_where_it_stays(cut):
+    plant = MadeUpPlant(1, 1, CYCLES)
+    table = plant.table.assign(**{"Y0.SP": 50.0})
+    with pytest.raises(
+        InputError, match=r"'Y0\.SP': the set points stay at 50, none is .*: change 'set_point' of 'y0', .*'error_scale'"
+    ):
+        cut(plant, table)
+    _, _, found = cut(plant, table, controlled=loop(plant, set_point=50.0, steady_state=48.0))
+    assert found.trajectories.n_trajectories == 2 * HOLD * CYCLES // (HORIZON + 1)
+    with pytest.raises(InputError, match=r"6 episodes of 99 samples at the set point of the task, expected 10"):
+        cut(plant, table, controlled=loop(plant, set_point=50.0, steady_state=48.0), horizon=99)
+
+
 def test_a_record_shorter_than_an_episode_is_refused_with_the_reasons(cut):
     plant = MadeUpPlant(2, 2, CYCLES)
     with pytest.raises(InputError, match=r"plant\.csv: 0 episodes of 100 samples .* left out: 1 cut short"):

@@ -231,3 +231,90 @@ def test_after_a_phase_in_manual_the_count_begins_anew(description):
     guard.follow(measured(), SET_POINT, guard.u)
     guard.step(measured((0, np.nan)), SET_POINT)
     assert guard.mode == Mode.HOLD
+
+
+class Noted(Asking):
+    """A policy with the notes of its file."""
+
+    def __init__(self, asked, description, **notes):
+        super().__init__(asked)
+        keys = {"name", "tag", "unit", "low", "high", "steady_state"}
+        self.notes = {"title": description.title, "sampling_time": [description.sampling_time, description.time_unit]}
+        self.notes |= {k: [v.model_dump(include=keys) for v in getattr(description, k)] for k in ("controlled", "manipulated")}
+        self.notes |= notes
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda d: {"title": "another"}, "'title' is made up in the policy and another in the description"),
+        (lambda d: {"time_unit": "min"}, "'sampling_time' in s is 2.0 in the policy and 120.0"),
+        (lambda d: {"controlled": d.controlled[:1]}, "the number of 'controlled' variables is 2 in the policy and 1"),
+        (lambda d: {"controlled": d.controlled[::-1]}, "'name' of 'y1' is y0 in the policy and y1"),
+        *(
+            (
+                lambda d, key=key, other=other: {
+                    "manipulated": (d.manipulated[0].model_copy(update={key: other}), d.manipulated[1])
+                },
+                says,
+            )
+            for key, other, says in (
+                ("tag", "U9.OP", "'tag' of 'u0' is U0.OP in the policy and U9.OP in the description"),
+                ("unit", "kg/h", "'unit' of 'u0' is % in the policy and kg/h in the description"),
+                ("high", 30.0, "'high' of 'u0' is 23.0 in the policy and 30.0 in the description"),
+                ("steady_state", 19.0, "'steady_state' of 'u0' is 20.0 in the policy and 19.0 in the description"),
+            )
+        ),
+    ],
+)
+def test_a_policy_under_a_description_that_is_not_its_own_is_refused(description, change, says):
+    policy = Noted([20.0, 21.0], description)
+    Guard(policy, description.model_copy(update={"time_unit": "min", "sampling_time": 2 / 60}))  # the same time
+    with pytest.raises(InputError, match="the policy was made for another description") as caught:
+        Guard(policy, description.model_copy(update=change(description)))
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("failure", ["raises", "returns another shape"])
+def test_a_policy_that_cannot_run_falls_back_like_a_bad_measurement(description, failure):
+    guard, measured = in_automatic(description)
+
+    def broken(y, set_point, u_previous):
+        if failure == "raises":
+            raise RuntimeError("onnxruntime")
+        return np.zeros((1, 7))
+
+    sound, guard.policy.step = guard.policy.step, broken
+    modes = [(guard.step(measured(), SET_POINT), guard.mode)[1] for _ in range(LIMITS.hold + 1)]
+    assert modes == [Mode.HOLD] * LIMITS.hold + [Mode.PID]
+    guard.follow(measured(), SET_POINT, guard.u)
+    guard.policy.step = sound
+    guard.step(measured(), SET_POINT)
+    assert guard.mode == Mode.POLICY
+
+
+def test_a_set_point_outside_the_range_of_the_policy_is_the_pid_s_until_it_is_back(description):
+    policy = Noted([22.0, 23.0], description, set_point_range=[[49.0, 51.0], [50.0, 52.0]])
+    guard, measured = Guard(policy, description, LIMITS), Measured()
+    for _ in range(30):
+        guard.step(measured(), SET_POINT)  # at the edge, which is inside
+    assert guard.mode == Mode.POLICY
+    asked, before = len(policy.seen), guard.u.copy()
+    outside = np.array([51.5, 52.0])
+    inputs = [guard.step(measured(), outside)]
+    assert guard.mode == Mode.PID
+    assert inputs[0] == pytest.approx(before)
+    inputs += [guard.step(measured(), outside) for _ in range(2)]
+    assert inputs[2][0] > inputs[1][0] > inputs[0][0]  # towards the set point that was given
+    guard.follow(measured(), outside, guard.u)
+    assert len(policy.seen) == asked
+    guard.step(measured(), outside)
+    assert guard.mode == Mode.PID
+    guard.step(measured((1, np.nan)), outside)
+    assert guard.mode == Mode.PID  # a bad measurement changes nothing there
+    for _ in range(LIMITS.healthy):
+        guard.step(measured(), outside)
+    last = guard.u.copy()
+    assert guard.step(measured(), SET_POINT) == pytest.approx(last)
+    assert guard.mode == Mode.POLICY
+    assert len(policy.seen) == asked + 1

@@ -117,6 +117,41 @@ def test_a_frozen_sensor_and_a_spike_are_found(clean, plant):
     assert found(after, "of no use").count == 30
 
 
+def moved_by_hand(tau, noise, digit, hold, seed=0, n_samples=3000):
+    """Rows of one output under PI control with set point steps, and moves by hand that last `hold` samples; no spike in it."""
+    rng = np.random.default_rng(seed)
+    x = integral = target = u = 0.0
+    delayed, rows = [0.0, 0.0], []
+    for t in range(n_samples):
+        target = rng.uniform(-10, 10) if t % 200 == 0 else target
+        y = digit * np.round((x + noise * rng.normal()) / digit)
+        integral += 0.1 / tau * (target - y)
+        if t % 200 < 180:
+            u = 0.3 * (target - y) + integral
+        elif t % hold == 0:
+            u = integral + rng.uniform(-8, 8)
+        delayed = [u, *delayed[:-1]]
+        x += (1 - np.exp(-1 / tau)) * (delayed[-1] - x)
+        rows.append([50 + y, 50 + target, 50 + u])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(
+    ("tau", "noise", "digit", "hold"),
+    [(0.3, 0.01, 1e-3, 1), (0.3, 0.01, 1e-3, 3), (2, 0.02, 1e-3, 4), (5, 0.002, 1e-3, 10), (2, 0.05, 0.5, 4), (8, 0.2, 0.1, 20)],
+)
+def test_good_samples_are_no_outliers_and_spikes_are_found_in_moves_by_hand_too(plant, clean, tau, noise, digit, hold):
+    rows = moved_by_hand(tau, noise, digit, hold)
+    single = {key: [plant.content[key][0] | {"low": -50.0, "high": 150.0}] for key in ("controlled", "manipulated")}
+    table = pd.DataFrame(rows, columns=["Y0.PV", "Y0.SP", "U0.OP"]).assign(TIME=2.0 * np.arange(len(rows)), MODE="AUTO")
+    assert not [entry for entry in clean(table, **single, pid=[]).findings if entry.check == "outlier"]
+    struck = [150, 790, 1230, 1333, 1334, 1750, 2221, 2650]  # of which two lie side by side
+    table.loc[struck, "Y0.PV"] += 80
+    after = clean(table, **single, pid=[])
+    assert found(after, "outlier").count == len(struck)
+    assert after.table["segment"].eq(0).all()  # and no coarse signal is taken for a frozen one
+
+
 def test_inputs_at_bounds_and_manual_rows_are_counted_and_kept(clean, plant):
     table = plant.table.copy()
     table.loc[10:14, "U0.OP"] = plant.steady_u[0] + 3
@@ -157,7 +192,15 @@ def test_what_no_rule_can_help_is_refused(clean, plant, tmp_path):
     assert "too little excitation" in refusal(clean, plant.table.assign(**{"U0.OP": 20.0}))
     moved = plant.table.assign(**{"U1.OP": plant.table["U0.OP"] - plant.steady_u[0] + plant.steady_u[1]})
     assert "move as one" in refusal(clean, moved)
-    assert "'sampling_time' is 1 s" in refusal(clean, plant.table, sampling_time=1.0)
+    for apart in (1.0, 0.02, 20.0, 200.0):
+        said = f"rows are 2 s apart, but 'sampling_time' is {apart:g} s: the one or the other, or 'time_unit', is wrong"
+        assert said in refusal(clean, plant.table, sampling_time=apart)
+    stamps = pd.Timestamp("2026-03-01") + pd.to_timedelta(plant.table["TIME"], unit="s")
+    sentence = refusal(clean, plant.table.assign(TIME=stamps), time_unit="min")
+    assert "rows are 0.0333333 min apart, but 'sampling_time' is 2 min: " in sentence
+    assert "'TIME': the time of all rows is the same" in refusal(clean, plant.table.assign(TIME=5.0))
+    coarse = refusal(clean, plant.table.assign(TIME=60.0 * (plant.table["TIME"] // 60)), sampling_time=60.0)
+    assert "97 % of the rows have the time of another one, the first is row 2" in coarse
     late = 0.9 * np.random.default_rng(0).integers(0, 2, len(plant.table))
     assert "between two samples" in refusal(clean, plant.table.assign(TIME=plant.table["TIME"] + late))
     assert "no time in rows 2, 3" in refusal(clean, plant.table.assign(TIME="yesterday"))

@@ -26,7 +26,16 @@ def _free(tag: str) -> str:
     return tag
 
 
+def _encoding(name: str) -> str:
+    try:
+        "".encode(name)
+    except (LookupError, ValueError) as error:
+        raise PydanticCustomError("encoding", "expected an encoding such as utf-8, latin-1 or cp1252") from error
+    return name
+
+
 Tag = Annotated[Text, AfterValidator(_free)]
+LONGEST_SAMPLING_TIME, LONGEST_HORIZON = 1e6, 100_000  # time units, samples: what a plant may need, and memory holds
 
 
 class Variable(Record):
@@ -92,6 +101,7 @@ class PlantDescription(Record):
 
     Attributes:
         data: CSV or Parquet file, relative to the description. time: its column of time stamps or numbers.
+        time_format: of its stamps, as in strptime. separator, decimal, encoding: of a CSV file. Without them all is found.
         sampling_time: in `time_unit`. horizon: T, samples of an episode. episode: a column that changes with every run.
         mode: a column; only rows where it holds one of `automatic` show the controller at work.
         plant: what stands for the plant online, `package.module:Class` or `gymnasium:Id`; without it the identified model does.
@@ -102,8 +112,12 @@ class PlantDescription(Record):
     data: Text
     time: Text
     time_unit: Literal["s", "min", "h"]
-    sampling_time: Positive
-    horizon: Count
+    time_format: Text | None = None
+    separator: Literal[",", ";", "\t", "tab", "|"] | None = None
+    decimal: Literal[".", ","] | None = None
+    encoding: Annotated[Text, AfterValidator(_encoding)] | None = None
+    sampling_time: Annotated[Positive, Field(gt=1e-6, le=LONGEST_SAMPLING_TIME)]
+    horizon: Annotated[Count, Field(le=LONGEST_HORIZON)]
     episode: Text | None = None
     mode: Text | None = None
     automatic: tuple[Text, ...] = ("AUTO",)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from helpers.own_plant.description import PlantDescription
+from helpers.own_plant.description import ControlledVariable, PlantDescription
 from helpers.own_plant.quality import CleanRecords
 from helpers.own_plant.settings import QualityParams
 from helpers.plant.task import Trajectories
@@ -64,24 +64,26 @@ def episodes(clean: CleanRecords, description: PlantDescription, params: Quality
     """The demonstrations of the description's task: T samples under automatic control after its set point step.
 
     An episode begins where the set points arrive at those of the task, the loops that move coming from the steady state. Where
-    no loop moves, stretches at the set point are cut into episodes one after the other.
+    no set point moves, in the task or in the record, stretches at the set point are cut into episodes one after the other.
 
     Raises:
-        InputError: if there are too few.
+        InputError: if there are too few, or the record does not come near the set point of the task.
     """
     table, n_steps = clean.table, description.horizon
+    moved = [
+        _comes_near(clean, variable, params.set_point_band * abs(variable.scale), description.data)
+        for variable in description.controlled
+    ]
     at_task, came_from = _set_points(clean, description, params)
-    moving = any(variable.set_point != variable.steady_state for variable in description.controlled if variable.set_point_tag)
+    described = any(variable.set_point != variable.steady_state for variable in description.controlled if variable.set_point_tag)
+    moving = described and any(moved)
     segment, automatic = table["segment"].to_numpy(), table["automatic"].to_numpy()
     counted = np.stack([segment >= 0, automatic, at_task]).astype(np.int64)
     totals = np.concatenate([np.zeros((3, 1), dtype=np.int64), counted.cumsum(1)], axis=1)
     length = n_steps + 1
     last = len(table) - length
-    first = (
-        np.flatnonzero(at_task[1:] & ~at_task[:-1] & came_from[:-1]) + 1
-        if moving
-        else _windows(segment, at_task & automatic, length)
-    )
+    arrives = at_task[1:] & ~at_task[:-1]
+    first = np.flatnonzero(arrives & came_from[:-1]) + 1 if moving else _windows(segment, at_task & automatic, length)
     fits = first <= last
     within = np.where(fits, first, 0)
     end = np.minimum(within + length, len(table))  # of a record shorter than an episode, which fits nowhere
@@ -94,10 +96,12 @@ def episodes(clean: CleanRecords, description: PlantDescription, params: Quality
     }
     starts = first[whole & hands_off & held]
     if len(starts) < params.fewest_episodes:
-        words = ", ".join(f"{number} {reason}" for reason, number in left_out.items())
+        reasons = left_out | ({"not from 'steady_state'": int((arrives & ~came_from[:-1]).sum())} if moving else {})
+        words = ", ".join(f"{number} {reason}" for reason, number in reasons.items())
+        where = "after a step to" if moving else "at"
         raise InputError(
-            f"{description.data}: {len(starts)} episodes of {n_steps} samples after a step to the set point of the task, expected "
-            f"{params.fewest_episodes} or more; left out: {words}"
+            f"{description.data}: {len(starts)} episodes of {n_steps} samples {where} the set point of the task, expected "
+            f"{params.fewest_episodes} or more; left out: {words} (keys 'horizon', 'set_point', 'steady_state')"
         )
     y, u = signals(clean, description)
     index = starts[None, :] + np.arange(length)[:, None]
@@ -108,6 +112,37 @@ def episodes(clean: CleanRecords, description: PlantDescription, params: Quality
     before = torch.tensor(u[np.where(segment[previous] == segment[starts], previous, starts)], dtype=dtype)
     rows = tuple(int(row) for row in table["row"].to_numpy()[starts])
     return Episodes(Trajectories(outputs, outputs, inputs, inputs), before, rows, left_out)
+
+
+def _comes_near(clean: CleanRecords, variable: ControlledVariable, band: float, data: str) -> bool:
+    """Whether the set point of a loop moves in the record.
+
+    Raises:
+        InputError: if none of its set points is that of the task, or no measurement comes half the way there.
+    """
+    usable = clean.table["segment"] >= 0
+    aim, key = f"that of the task, {variable.set_point:g} {variable.unit}", f"'set_point' of '{variable.name}'"
+
+    def near(tag: str, within: float) -> tuple[bool, float, float]:
+        values = clean.table.loc[usable, tag]
+        return bool((abs(values - variable.set_point) <= within).any()), float(values.min()), float(values.max())
+
+    moves = False
+    if variable.set_point_tag is not None:
+        known, low, high = near(variable.set_point_tag, band)
+        moves = high - low > band
+        if not known:
+            found = f"lie between {low:g} and {high:g}" if moves else f"stay at {low:g}"
+            raise InputError(
+                f"{data}: column '{variable.set_point_tag}': the set points {found}, none is {aim}: change {key}, "
+                f"and give 'error_scale' where it equals 'steady_state'"
+            )
+    reached, low, high = near(variable.tag, abs(variable.scale) / 2)
+    if not reached:
+        raise InputError(
+            f"{data}: column '{variable.tag}': lies between {low:g} and {high:g}, never near the set point, {aim}: change {key}"
+        )
+    return moves
 
 
 def _set_points(clean: CleanRecords, description: PlantDescription, params: QualityParams) -> tuple[NDArray, NDArray]:

@@ -1,17 +1,22 @@
 """What stands between a deployed policy and a plant: limits, bad measurements, the fall-back PID and the switch from manual."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from math import isclose
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from simple_pid import PID
 
 from helpers.own_plant.deploy import DeployedPolicy
-from helpers.own_plant.description import PlantDescription
+from helpers.own_plant.description import SECONDS, PlantDescription, Variable
 from helpers.settings.leaf import InputError
 
 Array = NDArray[np.float64]
+NOTED = ("name", "tag", "unit", "low", "high", "steady_state")  # of each variable in the notes of a policy file
+LAST_DIGIT = 1e-6  # of the range of a variable: by so much a set point may miss the range of the policy
 
 
 class Mode(StrEnum):
@@ -48,8 +53,12 @@ class Guard:
     where the operator left it, and the difference to what the policy asks for fades. A measurement that is not a number, lies
     outside its range or does not change is bad, and so is a set point that is no number; the last one that was a number counts on.
     While anything is bad the policy's memory stands still and the inputs are held; then the PID loops whose measurement is good
-    take over from where the inputs are, and the others stay held. The inputs never leave their bounds nor move faster than their
-    rate.
+    take over from where the inputs are, and the others stay held. They also do, at once, while a set point lies outside the range
+    that the policy was trained for, which its file notes as `set_point_range`. A policy that raises counts as bad. The inputs
+    never leave their bounds nor move faster than their rate.
+
+    Raises:
+        InputError: if the policy was made for another plant than the described one, or two loops set the same input.
     """
 
     policy: DeployedPolicy
@@ -58,6 +67,12 @@ class Guard:
 
     def __post_init__(self) -> None:
         controlled, manipulated = self.description.controlled, self.description.manipulated
+        notes = getattr(self.policy, "notes", {})
+        if differences := _differences(notes, self.description):
+            raise InputError(f"{self.description.title}: the policy was made for another description: {'; '.join(differences)}")
+        slack = LAST_DIGIT * np.array([variable.high - variable.low for variable in controlled])
+        self.trained = np.array(notes.get("set_point_range", [(-np.inf, np.inf)] * len(controlled)), dtype=float).T
+        self.trained = np.stack([self.trained[0] - slack, self.trained[1] + slack])
         self.low = np.array([variable.low for variable in manipulated])
         self.high = np.array([variable.high for variable in manipulated])
         self.rate = np.array([np.inf if variable.rate is None else variable.rate for variable in manipulated])
@@ -81,16 +96,20 @@ class Guard:
         """A sample in manual: the operator has set `u`; of an input that is no number the last one counts on."""
         self.mode = Mode.MANUAL
         self.n_bad = self.n_good = 0
-        self._ask(y, self._look(y) & self._aim(set_point))
+        good = self._look(y) & self._aim(set_point)
+        if not self._beyond():
+            self._ask(y, good)
         self.u = np.where(np.isfinite(u), u, self.u).astype(float)
 
     def step(self, y: Array, set_point: Array) -> Array:
         """A sample in automatic: the inputs to apply, (n_u,)."""
         good = self._look(y)
-        wanted = self._ask(y, good & self._aim(set_point))
-        healthy = bool(np.isfinite(wanted).all())
+        sound = good & self._aim(set_point)
+        beyond = self._beyond()
+        wanted = np.full(len(self.u), np.nan) if beyond else self._ask(y, sound)
+        healthy = bool(sound.all() if beyond else np.isfinite(wanted).all())
         self.n_bad, self.n_good = (self.n_bad, self.n_good + 1) if healthy else (self.n_bad + 1, 0)
-        before, self.mode = self.mode, self._next_mode(healthy)
+        before, self.mode = self.mode, Mode.PID if beyond else self._next_mode(healthy)
         if self.mode == Mode.POLICY:
             self.n_bad = 0  # not before: a sensor that comes and goes would have the inputs held for ever
             command, fresh = wanted, np.full(len(self.u), before != Mode.POLICY)
@@ -125,11 +144,20 @@ class Guard:
         self.set_point = np.where(given, set_point, self.set_point)
         return given
 
+    def _beyond(self) -> bool:
+        """Whether a set point lies where the policy was never trained."""
+        return bool(((self.set_point < self.trained[0]) | (self.set_point > self.trained[1])).any())  # nan does not
+
     def _ask(self, y: Array, good: NDArray[np.bool_]) -> Array:
         """What the policy would do, (n_u,), nan if anything is bad: its memory does not advance on that."""
+        nothing = np.full(len(self.u), np.nan)
         if not good.all():
-            return np.full(len(self.u), np.nan)
-        return self.policy.step(np.atleast_2d(y).astype(float), self.set_point[None].astype(float), self.u[None])[0]
+            return nothing
+        try:
+            asked = self.policy.step(np.atleast_2d(y).astype(float), self.set_point[None].astype(float), self.u[None])
+        except Exception:  # onnxruntime's own errors have no common kind, and none may stop the control of a plant
+            return nothing
+        return asked[0] if np.shape(asked) == (1, len(self.u)) else nothing
 
     def _pid(self, y: Array, good: NDArray[np.bool_], begins: bool) -> tuple[Array, NDArray[np.bool_]]:
         """The fall-back: loops with a good measurement, every other input stays where it is; and which loops begin now."""
@@ -150,3 +178,32 @@ class Guard:
             pid.setpoint = self.set_point[output]
             command[index] = pid(y[output], dt=self.description.sampling_time)
         return command, fresh
+
+
+def _differences(notes: Mapping[str, Any], description: PlantDescription) -> list[str]:
+    """In what a plant differs from the one that a policy was made for, as its file notes it; in words."""
+    found = []
+
+    def compare(what: str, noted: Any, own: Any) -> None:
+        numbers = all(isinstance(value, int | float) for value in (noted, own))
+        if not (isclose(noted, own, rel_tol=1e-9) if numbers else noted == own):
+            found.append(f"{what} is {noted} in the policy and {own} in the description")
+
+    if "title" in notes:
+        compare("'title'", notes["title"], description.title)
+    if "sampling_time" in notes:
+        time, unit = notes["sampling_time"]
+        own = description.sampling_time * SECONDS[description.time_unit]
+        compare("'sampling_time' in s", time * SECONDS[unit], own)
+    kinds: dict[str, tuple[Variable, ...]] = {"controlled": description.controlled, "manipulated": description.manipulated}
+    for kind, variables in kinds.items():
+        noted = notes.get(kind, [])
+        if kind in notes:
+            compare(f"the number of '{kind}' variables", len(noted), len(variables))
+        for entry, variable in zip(noted, variables, strict=False):
+            for key in NOTED:
+                if key in entry:
+                    compare(f"'{key}' of '{variable.name}'", entry[key], getattr(variable, key))
+    if "set_point_range" in notes:
+        compare("the shape of 'set_point_range'", np.shape(notes["set_point_range"]), (len(description.controlled), 2))
+    return found

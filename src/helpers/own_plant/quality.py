@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import pandas as pd
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
@@ -14,6 +15,14 @@ from helpers.own_plant.settings import QualityParams
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 AT_BOUND = 1e-3  # of the range: as near to a bound as a rounded number may lie
+MOST = 0.5  # share of rows with a time of their own: of two exports in one file half
+COARSE = 1 / 3  # share of values that equal the one before, above which a signal is coarse
+BY_CHANCE = 0.01  # runs of equal values that a record may hold by chance and that are taken for a frozen sensor
+TINY = 1e-9
+SPIKE = (1, 2)  # samples that a spike may last
+NEARBY = 4  # moves before and after a spike that it is compared with
+RESPONSE = 12  # samples in which an output answers a pulse of an input
+CAUSED = 2.0  # how far a pulse may move an output beyond its share of the range
 # What a number in the one unit is in the other: the usual mistakes.
 CONVERSIONS = {
     "degrees Celsius for kelvin": lambda v: v + 273.15,
@@ -56,11 +65,12 @@ def examine(records: Records, description: PlantDescription, params: QualityPara
     columns = _regular(records, description, params, found)
     row, breaks = columns["row"], np.diff(columns["run"], prepend=columns["run"][:1]) != 0
     valid = np.ones(len(row), dtype=bool)
+    pulses = _pulses([columns[tag] for tag in (*(v.tag for v in description.manipulated), *description.set_point_tags)])
     for controlled in description.controlled:
         values = columns[controlled.tag]
         _outside(records, controlled.tag, values, (controlled.low, controlled.high), controlled.unit, row, params, found)
         _frozen(controlled.tag, values, row, params, found)
-        _spikes(controlled.tag, values, breaks, row, params, found)
+        _spikes(controlled.tag, values, breaks, pulses, row, params, found)
         valid &= _fill(controlled.tag, values, breaks, row, params, found, straight=True)
     for manipulated in description.manipulated:
         values, span = columns[manipulated.tag], manipulated.high - manipulated.low
@@ -98,14 +108,22 @@ def _regular(records: Records, description: PlantDescription, params: QualityPar
     table, path, time = records.table, records.path, description.time
     row, clock = table["row"].to_numpy(), table["clock"].to_numpy()
     step = np.diff(clock)
-    typical = float(np.median(step[step > 0.5])) if (step > 0.5).any() else 1.0
+    if not (step > 0).any():
+        raise PlantDataError(f"{path}: column '{time}': the time of all rows is the same")
+    typical = float(np.median(step[step > 0]))
     if abs(typical - 1) > 0.02:
+        unit, dt = description.time_unit, description.sampling_time
         raise PlantDataError(
-            f"{path}: column '{time}': rows are {typical * description.sampling_time:g} {description.time_unit} apart, "
-            f"but 'sampling_time' is {description.sampling_time:g} {description.time_unit}"
+            f"{path}: column '{time}': rows are {typical * dt:g} {unit} apart, but 'sampling_time' is {dt:g} {unit}: "
+            f"the one or the other, or 'time_unit', is wrong"
         )
     samples = np.rint(step)
     keep = np.append(samples > 0, True)  # of rows with the same time the last one counts
+    if keep.mean() < MOST:
+        raise PlantDataError(
+            f"{path}: column '{time}': {100 * (1 - keep.mean()):.0f} % of the rows have the time of another one, the first is "
+            f"{name_rows(row[~keep][:1])}; export the record with a finer time"
+        )
     found += finding("doubled row", time, row[~keep], "the last one kept")
     row, clock = row[keep], clock[keep]
     step = np.diff(clock)
@@ -161,24 +179,77 @@ def _outside(
 
 
 def _frozen(tag: str, values: Array, row: NDArray, params: QualityParams, found: list[Finding]) -> None:
-    """A sensor that repeats the very same value for long is frozen: all but the first become missing."""
-    same = np.diff(values, prepend=np.nan) == 0
-    frozen = _long_runs(same, params.frozen - 1)
-    found += finding("frozen sensor", tag, _rows(row, frozen), f"{params.frozen} or more equal values: all but the first missing")
+    """A sensor that repeats the very same value for long is frozen: all but the first become missing.
+
+    Long is what chance would hardly bring about, given how often two values are the same elsewhere; of a coarse signal, which
+    stays the same as often as not, a repetition says nothing.
+    """
+    move = np.diff(values, prepend=np.nan)
+    same = move == 0
+    long = _long_runs(same, params.frozen - 1)
+    elsewhere = np.isfinite(move) & ~long
+    share = max(float(same[elsewhere].mean()), TINY) if elsewhere.any() else TINY
+    if share > COARSE:
+        found += finding("equal values", tag, _rows(row, long), "kept: the signal is coarse")
+        return
+    least = max(params.frozen, 1 + int(np.ceil(np.log(BY_CHANCE / len(values)) / np.log(share))))
+    frozen = _long_runs(same, least - 1)
+    found += finding("frozen sensor", tag, _rows(row, frozen), f"{least} or more equal values: all but the first missing")
     values[frozen] = np.nan
 
 
-def _spikes(tag: str, values: Array, breaks: Mask, row: NDArray, params: QualityParams, found: list[Finding]) -> None:
-    """A value far from the median of itself and its two neighbours to each side is a spike (after Hampel's identifier).
+def _spikes(
+    tag: str, values: Array, breaks: Mask, pulses: Array, row: NDArray, params: QualityParams, found: list[Finding]
+) -> None:  # fmt: skip
+    """A value that departs and returns at once is a spike.
 
-    Far is a multiple of the distance that all but a twentieth of the values keep: a plant under way moves more than one at rest.
+    It sticks out of both neighbours by a multiple of the largest other move nearby and of a usual one: a step, a ramp, a peak,
+    an oscillation and the toggling of the last digit move as much before or after. What a pulse of an input may have caused is
+    none: a pulse over the whole range of the input moves the output over its whole range, spikes apart.
     """
     known = np.flatnonzero(np.isfinite(values))
-    distance = np.abs(values[known] - median_filter(values[known], size=5, mode="nearest"))
-    scale = float(np.quantile(distance, 0.95)) if len(distance) else 0.0
-    spike = known[(distance > params.outlier * scale) & (scale > 0) & ~breaks[known]]
-    found += finding("outlier", tag, row[spike], "missing")
-    values[spike] = np.nan
+    if len(known) < max(SPIKE) + 2:
+        return
+    series, group = values[known], breaks.cumsum()[known]
+    move = np.abs(np.diff(series))
+    moves = move[move > 0]
+    usual = np.median(moves) if len(moves) else np.inf  # of a coarse signal one step of its resolution
+    largest = sliding_window_view(np.pad(move, NEARBY), NEARBY).max(1)  # [i]: of the moves from sample i - NEARBY to sample i
+    caused = CAUSED * np.ptp(median_filter(series, size=2 * max(SPIKE) + 1, mode="nearest")) * pulses[known]
+    spike = np.zeros(len(known), dtype=bool)
+    for width in SPIKE:
+        sticks_out = _sticks_out(series, width)
+        left = np.arange(len(sticks_out))
+        right = left + width + 1
+        other = np.maximum.reduce([largest[left], largest[right + NEARBY], np.abs(series[right] - series[left])])
+        near = (group[left] == group[right]) & (known[right] - known[left] <= width + 1 + params.longest_repair)
+        far = near & (sticks_out > params.outlier * np.maximum(other, usual)) & (sticks_out > caused[left + 1])
+        for inside in range(1, width + 1):
+            spike[left[far] + inside] = True
+    found += finding("outlier", tag, row[known[spike]], "missing")
+    values[known[spike]] = np.nan
+
+
+def _pulses(inputs: list[Array]) -> Array:
+    """The largest short pulse of an input or a set point in the samples before each sample, as a share of its range, (n,)."""
+    size = np.zeros(len(inputs[0]) + RESPONSE)
+    for values in inputs:
+        span = np.nanmax(values) - np.nanmin(values)
+        for width in SPIKE:
+            share = np.nan_to_num(_sticks_out(values, width) / (span or 1.0))
+            for inside in range(width):
+                part = size[RESPONSE + 1 + inside :][: len(share)]
+                np.maximum(part, share, out=part)
+    return sliding_window_view(size, RESPONSE)[:-1].max(1)
+
+
+def _sticks_out(values: Array, width: int) -> Array:
+    """By how much samples i + 1 to i + `width` all lie above, or all below, both samples i and i + `width` + 1; for every i."""
+    if len(values) < width + 2:
+        return np.zeros(0)
+    inside = sliding_window_view(values[1:-1], width)
+    left, right = values[: -width - 1], values[width + 1 :]
+    return np.maximum(inside.min(1) - np.maximum(left, right), np.minimum(left, right) - inside.max(1))
 
 
 def _fill(tag: str, values: Array, breaks: Mask, row: NDArray, params: QualityParams, found: list[Finding], straight: bool) -> Mask:

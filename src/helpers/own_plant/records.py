@@ -1,5 +1,8 @@
 """A historian file read into one table of numbers, with what could not be read counted."""
 
+import codecs
+import csv as text
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,13 +10,16 @@ import numpy as np
 import pandas as pd
 import pandera.pandas as pa
 import pyarrow as arrow
-from pyarrow import csv, parquet
+from pyarrow import compute, csv, parquet
 
 from helpers.own_plant.description import SECONDS, PlantDescription
+from helpers.own_plant.stamps import FIRST_ROW, seconds
 from helpers.settings.leaf import InputError
 
-FIRST_ROW = 2  # of the file: the first holds the names of the columns
 SHOWN = 5  # rows named in a finding
+HEAD = 1 << 16  # characters of a CSV file that show how it is written
+SEPARATORS = (",", ";", "\t", "|")
+NAMES = {"\t": "tab"}
 
 
 class PlantDataError(InputError):
@@ -68,7 +74,7 @@ def read_records(path: Path, description: PlantDescription) -> Records:
     Raises:
         PlantDataError: if the file or a column is missing, a column holds no number, or the time cannot be read.
     """
-    raw = _read(path, description.columns)
+    raw = _read(path, description)
     if not len(raw):
         raise PlantDataError(f"{path}: the file holds no rows")
     rows = np.arange(FIRST_ROW, FIRST_ROW + len(raw))
@@ -82,7 +88,8 @@ def read_records(path: Path, description: PlantDescription) -> Records:
         numbers = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
         bad = ~np.isfinite(numbers)
         if bad.all():
-            raise PlantDataError(f"{path}: column '{tag}': holds no number")
+            shown = str(column.iloc[0])[:40]
+            raise PlantDataError(f"{path}: column '{tag}': holds no number, the first is '{shown}' (keys 'separator', 'decimal')")
         numbers = np.where(bad, np.nan, numbers) if bad.any() else numbers
         found += finding("no number", tag, rows[bad], "missing")
         columns[tag] = numbers
@@ -96,40 +103,101 @@ def read_records(path: Path, description: PlantDescription) -> Records:
     return Records(path, _schema(description).validate(table), tuple(found))
 
 
-def _read(path: Path, columns: tuple[str, ...]) -> pd.DataFrame:
+def _read(path: Path, description: PlantDescription) -> pd.DataFrame:
     if not path.is_file():
         raise PlantDataError(f"{path}: the historian file is missing")
+    columns, kind = list(description.columns), "Parquet" if path.suffix == ".parquet" else "CSV"
     try:
-        if path.suffix == ".parquet":
-            known = parquet.read_schema(path).names
+        if kind == "Parquet":
+            _expect(columns, parquet.read_schema(path).names, path)
+            found = parquet.read_table(path, columns=columns)
         else:
-            with csv.open_csv(path) as head:
-                known = head.schema.names
-        for column in columns:
-            if column not in known:
-                raise PlantDataError(f"{path}: there is no column '{column}'; the columns are {', '.join(known)}")
-        if path.suffix == ".parquet":
-            found = parquet.read_table(path, columns=list(columns))
-        else:
-            found = csv.read_csv(path, convert_options=csv.ConvertOptions(include_columns=list(columns)))
+            found = _read_text(path, description, columns)
+    except UnicodeError as error:
+        raise PlantDataError(f"{path}: not readable by the 'encoding' {description.encoding}: {error}") from error
     except (arrow.ArrowInvalid, OSError) as error:
         words = " ".join(str(error).split())[:200]
-        raise PlantDataError(f"{path}: not readable as {'Parquet' if path.suffix == '.parquet' else 'CSV'}: {words}") from error
+        hint = "; the keys 'separator', 'decimal' and 'encoding' say what is not found right" if kind == "CSV" else ""
+        raise PlantDataError(f"{path}: not readable as {kind}: {words}{hint}") from error
     return found.to_pandas(types_mapper=pd.ArrowDtype, self_destruct=True)
 
 
+def _read_text(path: Path, description: PlantDescription, columns: list[str]) -> arrow.Table:
+    """A CSV file, read as its description says, or else as its head shows."""
+    encoding = description.encoding or _encoding(path)
+    with path.open(encoding=encoding, newline="") as file:
+        head = file.read(HEAD).removeprefix("\ufeff").splitlines() or [""]
+    head = head[: max(1, len(head) - 1)]  # the last line may be cut
+    separator = {None: None, "tab": "\t"}.get(description.separator, description.separator) or max(
+        SEPARATORS, key=lambda mark: len({*columns} & {*_cells(head[:1], mark)[0]})
+    )
+    tags = [column for column in columns if column not in (description.time, description.episode, description.mode)]
+    decimal = description.decimal or _decimal(_cells(head, separator), tags)
+    reading = csv.ReadOptions(encoding=encoding)
+    parsing = csv.ParseOptions(delimiter=separator)
+    with csv.open_csv(path, reading, parsing) as file:
+        _expect(columns, file.schema.names, path, f", separated by {NAMES.get(separator, separator)!r} (key 'separator')")
+    as_text = {description.time: arrow.string()} if description.time_format else {}
+    options = csv.ConvertOptions(include_columns=columns, decimal_point=decimal, column_types=as_text)
+    found = csv.read_csv(path, reading, parsing, options)
+    if decimal == ",":  # a word among the numbers leaves them text
+        for tag in tags:
+            if arrow.types.is_string(found[tag].type):
+                place = found.column_names.index(tag)
+                found = found.set_column(place, tag, compute.replace_substring(found[tag], ",", "."))
+    return found
+
+
+def _expect(columns: list[str], known: list[str], path: Path, how: str = "") -> None:
+    for column in columns:
+        if column not in known:
+            raise PlantDataError(f"{path}: there is no column '{column}'; the columns are {', '.join(known)}{how}")
+
+
+def _encoding(path: Path) -> str:
+    """UTF-8 or UTF-16 where the file is that throughout, and otherwise what Western European programs write."""
+    with path.open("rb") as file:
+        if file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+            return "utf-16"
+        file.seek(0)
+        decoder = codecs.getincrementaldecoder("utf-8")()
+        try:
+            while block := file.read(1 << 20):
+                decoder.decode(block)
+            decoder.decode(b"", final=True)
+        except UnicodeDecodeError:
+            return "latin-1"
+    return "utf-8"
+
+
+def _cells(lines: list[str], separator: str) -> list[list[str]]:
+    return list(text.reader(lines, delimiter=separator)) or [[]]
+
+
+def _decimal(rows: list[list[str]], tags: list[str]) -> str:
+    """What stands before the decimals of most of the numbers."""
+    places = [place for place, name in enumerate(rows[0]) if name in tags]
+    cells = [row[place].strip() for row in rows[1:] for place in places if place < len(row)]
+    commas, points = (
+        sum(bool(re.fullmatch(rf"[+-]?\d*{mark}\d+([eE][+-]?\d+)?", cell)) for cell in cells) for mark in (",", r"\.")
+    )
+    return "," if commas > points else "."
+
+
 def _clock(time: pd.Series, path: Path, description: PlantDescription) -> np.ndarray:
-    """Time in samples since the first row: stamps with a date, or numbers in the unit of the description."""
-    if not pd.api.types.is_numeric_dtype(time):
-        known = time if pd.api.types.is_datetime64_any_dtype(time) else time.astype(str)
-        stamps = pd.to_datetime(known, errors="coerce", utc=True)  # with or without a zone; a change of the clocks is no gap then
-        seconds = stamps.astype("datetime64[ns, UTC]").astype("int64") / 1e9
-        numbers = seconds.where(stamps.notna()).to_numpy(dtype=float, na_value=np.nan) / SECONDS[description.time_unit]
-    else:
+    """Time in samples since the first row: stamps, or numbers in the unit of the description."""
+    where = f"{path}: column '{description.time}'"
+    if pd.api.types.is_numeric_dtype(time) and not description.time_format:
         numbers = time.to_numpy(dtype=float, na_value=np.nan)
+    else:
+        try:
+            numbers = seconds(time, description.time_format) / SECONDS[description.time_unit]
+        except InputError as error:
+            raise PlantDataError(f"{where}: {error}") from error
     bad = np.flatnonzero(~np.isfinite(numbers)) + FIRST_ROW
     if len(bad):
-        raise PlantDataError(f"{path}: column '{description.time}': no time in {name_rows(bad)}")
+        how = f"of the 'time_format' {description.time_format}" if description.time_format else "(keys 'time_format', 'decimal')"
+        raise PlantDataError(f"{where}: no time in {name_rows(bad)} {how}")
     return (numbers - numbers.min()) / description.sampling_time
 
 

@@ -13,7 +13,7 @@ class QualityParams(Record):
 
     longest_repair: Annotated[Count, Leaf("samples")]
     frozen: Annotated[Count, Leaf("samples")]
-    outlier: Annotated[Positive, Leaf("95 % quantile")]
+    outlier: Annotated[Positive, Leaf("largest move nearby")]
     outside: Annotated[Share, Leaf("share")]
     jitter: Annotated[Positive, Field(lt=0.5), Leaf("sampling time")]
     least_movement: Annotated[Share, Leaf("input range")]

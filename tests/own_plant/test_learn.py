@@ -22,7 +22,7 @@ from tests.own_plant.plants import HORIZON, MadeUpPlant
 QUICK = {
     "identification": {"orders": (1, 2), "longest_dead_time": 2},
     "rivals": {"penalties": (1.0, 100.0), "episodes": 16},
-    "gate": {"episodes": 20},
+    "gate": {"models": 10, "episodes": 2},
     "online": {"explore": 8, "test": 6},
 }
 FILES = {
@@ -35,7 +35,7 @@ FILES = {
         ("orders: {value: [1, 2, 3, 4],", "orders: {value: [1, 2],"),
         ("longest_dead_time: {value: 10,", "longest_dead_time: {value: 2,"),
         ("penalties: {value: [0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0],", "penalties: {value: [1.0, 100.0],"),
-        ("episodes: {value: 400,", "episodes: {value: 40,"),
+        ("models: {value: 150,", "models: {value: 20,"),
     ),
 }
 

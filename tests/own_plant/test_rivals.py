@@ -92,17 +92,24 @@ def test_the_gate_releases_what_is_better_and_nothing_else(operation, params):
     slow, good = VelocityPID(pid(0.5, 0.05)), VelocityPID(pid(1.5, 0.12))
 
     def verdict(policy, allowed, **others):
-        return judge({RECORD: slow, **others, POLICY: policy}, noisy, quiet, operation, allowed, params.gate)
+        return judge(
+            {RECORD: slow, **others, POLICY: policy},
+            noisy,
+            quiet,
+            operation,
+            allowed,
+            params.gate.model_copy(update={"episodes": 1}),
+        )
 
     better = verdict(good, 10.0)
     assert better.released
     assert better.keep == POLICY
     assert better.words.startswith("verdict: release the policy: on models held out its mean |e| is ")
-    assert len(better.episodes) == 32
+    assert len(better.models) == 32
     assert not verdict(good, 0.5).released
     assert "times as much" in verdict(good, 0.5).words
     worse = verdict(VelocityPID(pid(0.2, 0.02)), 10.0)
-    assert worse.words.startswith("verdict: keep the PID: the policy is not released: it is better in only ")
+    assert worse.words.startswith("verdict: keep the PID: the policy is not released: it is better on only ")
     drifting = verdict(VelocityPID(pid(3.0, 0.0)), 10.0)
     assert "it leaves an offset of" in drifting.words
     as_good = verdict(good, 10.0, **{TUNED: good})

@@ -19,13 +19,13 @@ class Verdict:
     """What the gate found.
 
     Attributes:
-        table: a row a controller: mean |e| and movement as shares of those of the record's PID, share of the episodes in which it
-            is better, offset as a share of the range, whether it passes. episodes: the first two of each episode; a row each.
+        table: a row a controller: mean |e| and movement as shares of those of the record's PID, share of the models on which it
+            is better, offset as a share of the range, whether it passes. models: the first two on each model, a row each.
         released: whether the policy passes. keep: the controller to keep. words: the sentence that says so.
     """
 
     table: pd.DataFrame
-    episodes: pd.DataFrame
+    models: pd.DataFrame
     released: bool
     keep: str
     words: str
@@ -40,20 +40,22 @@ def offsets(run: Tracked, operation: Operation) -> torch.Tensor:
 def judge(
     candidates: Mapping[str, Tracker], noisy: Scenarios, quiet: Scenarios, operation: Operation, allowed: float, params: GateParams
 ) -> Verdict:
-    """Every candidate on the same episodes of models held out; `quiet` ones tell the offset.
+    """Every candidate on the same episodes of models held out, several of each after each other; `quiet` ones tell the offset.
 
     Args:
         candidates: by name, the record's PID among them. allowed: movement, as a multiple of that of the record's PID.
     """
-    rows, errors, episodes = {}, {}, []
+    rows, errors, models = {}, {}, []
     with torch.no_grad():
         for name, tracker in candidates.items():
             run = track(tracker, noisy, operation.bounds)
-            errors[name], movement = operation.error(run).double(), operation.movement(run).double()
+            errors[name], movement = (
+                value.double().reshape(-1, params.episodes).mean(1) for value in (operation.error(run), operation.movement(run))
+            )
             if name == RECORD:
                 moved = movement
             parts = {"mean |e|": errors[name] / errors[RECORD], "movement": movement / moved}
-            episodes.append(pd.DataFrame(parts).assign(controller=name))
+            models.append(pd.DataFrame(parts).assign(controller=name))
             rest = offsets(track(tracker, quiet, operation.bounds), operation)
             rows[name] = {
                 "mean |e|": (errors[name] / errors[RECORD]).mean().item(),
@@ -68,7 +70,7 @@ def judge(
     passing = [name for name in SIMPLEST if name in rows and (name == RECORD or fine[name])]
     best = min(table.loc[name, "mean |e|"] for name in passing)
     keep = next(name for name in passing if table.loc[name, "mean |e|"] <= best * (1 + params.close))
-    return Verdict(table, pd.concat(episodes, ignore_index=True), released, keep, _words(table, released, keep, allowed, params))
+    return Verdict(table, pd.concat(models, ignore_index=True), released, keep, _words(table, released, keep, allowed, params))
 
 
 def _words(table: pd.DataFrame, released: bool, keep: str, allowed: float, params: GateParams) -> str:
@@ -79,7 +81,7 @@ def _words(table: pd.DataFrame, released: bool, keep: str, allowed: float, param
         return f"its mean |e| is {100 * error:.0f} % of that of the record's PID at {100 * movement:.0f} % of its movement"
 
     if keep == POLICY:
-        better = f"it is better in {100 * table.loc[POLICY, 'better']:.0f} % of the episodes"
+        better = f"it is better on {100 * table.loc[POLICY, 'better']:.0f} % of the models"
         return f"verdict: release the policy: on models held out {share(POLICY)}, and {better}"
     policy = table.loc[POLICY]
     rival = "" if keep == RECORD else f"; {keep} would do: {share(keep)}"
@@ -88,7 +90,7 @@ def _words(table: pd.DataFrame, released: bool, keep: str, allowed: float, param
     faults = [
         words
         for bad, words in (
-            (policy["better"] < params.better, f"it is better in only {100 * policy['better']:.0f} % of the episodes"),
+            (policy["better"] < params.better, f"it is better on only {100 * policy['better']:.0f} % of the models"),
             (policy["movement"] > allowed, f"it moves the inputs {policy['movement']:.2f} times as much"),
             (policy["offset"] > params.offset, f"it leaves an offset of {100 * policy['offset']:.1f} % of the range"),
         )

@@ -34,7 +34,7 @@ from helpers.settings.leaf import InputError
 from helpers.settings.paper import Params, ScaleParams, load
 
 PIECE = 5  # episodes: how long the pieces of a long record are that the model is identified from
-HELD, FEWEST = 2.0, 0.1  # |e| in units of the range that a loop which is held never exceeds; least share of such models
+HELD, FEWEST = 0.2, 0.25  # |e| in units of the range within which a loop that is held settles; least share of such models
 HARM = 8.0  # how many times more an error counts that goes beyond that of the record's PID
 SLACK, BEYOND = 0.95, 10.0  # share of the allowed movement that is aimed at, and the price of more while the rivals are tuned
 
@@ -170,10 +170,10 @@ class Workshop:
         return min(max(2 * self.plant.description.horizon, shortest), longest)
 
     def draw(
-        self, models: ArmaxModel, n_episodes: int, generator: torch.Generator, longer: int = 1, quiet: bool = False
+        self, models: ArmaxModel, n_models: int, generator: torch.Generator, longer: int = 1, each: int = 1, quiet: bool = False
     ) -> Scenarios:
-        """Episodes of models drawn from these; `longer` than those of training by this factor."""
-        drawn = models.members(torch.randint(len(models), (n_episodes,), generator=generator))
+        """`each` episodes of models drawn from these, after each other; `longer` than those of training by this factor."""
+        drawn = models.members(torch.randint(len(models), (n_models,), generator=generator).repeat_interleave(each))
         return draw_scenarios(drawn, self.operation, self.plant.params.operation, longer * self.n_steps, generator, quiet)
 
     def reference(self, scenarios: Scenarios) -> tuple[Tensor, Tensor]:
@@ -263,11 +263,11 @@ def learn_policy(
 
 
 def pass_gate(workshop: Workshop, candidates: Mapping[str, Tracker]) -> Verdict:
-    """All candidates on models held out, in episodes twice as long as those of training."""
+    """All candidates on models held out, in several episodes of each, twice as long as those of training."""
     params, generator = workshop.plant.params, workshop.plant.stream("gate")
-    noisy, quiet = (
-        workshop.draw(workshop.held_out, params.gate.episodes, generator, longer=2, quiet=still) for still in (False, True)
-    )
+    n_models, each = params.gate.models, params.gate.episodes
+    noisy = workshop.draw(workshop.held_out, n_models, generator, longer=2, each=each)
+    quiet = workshop.draw(workshop.held_out, n_models, generator, longer=2, each=each, quiet=True)
     return judge(candidates, noisy, quiet, workshop.operation, params.policy.movement, params.gate)
 
 

@@ -76,6 +76,7 @@ class PlantPolicyParams(Record):
 class GateParams(Record):
     """What a controller must show on models held out before it is released."""
 
+    models: Annotated[Count, Leaf("models")]
     episodes: Annotated[Count, Leaf("episodes")]
     better: Annotated[Share, Leaf("share")]
     offset: Annotated[Share, Leaf("range of the set points")]

@@ -100,10 +100,10 @@ def loops_figure(workshop: Workshop, candidates: Mapping[str, Tracker], descript
 
 
 def gate_figure(verdict: Verdict) -> Figure:
-    """Every episode of the gate: mean |e| and movement of each controller as shares of those of the record's PID."""
+    """Every model of the gate: mean |e| and movement of each controller as shares of those of the record's PID."""
     figure = empty_figure(WIDTH, 3.4)
     for axis, (what, label) in zip(figure.subplots(1, 2), SHARES.items(), strict=True):
-        frame = verdict.episodes[verdict.episodes["controller"] != RECORD]
+        frame = verdict.models[verdict.models["controller"] != RECORD]
         order = [name for name in SIMPLEST if name != RECORD]
         seaborn.boxenplot(
             frame, x=what, y="controller", hue="controller", order=order, hue_order=order, palette=list(CANDIDATES[1:]),

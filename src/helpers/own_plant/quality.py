@@ -18,11 +18,12 @@ AT_BOUND = 1e-3  # of the range: as near to a bound as a rounded number may lie
 MOST = 0.5  # share of rows with a time of their own: of two exports in one file half
 COARSE = 1 / 3  # share of values that equal the one before, above which a signal is coarse
 BY_CHANCE = 0.01  # runs of equal values that a record may hold by chance and that are taken for a frozen sensor
+BEFORE, AT_REST = 10, 0.02  # moves before such a run, and how small their median is, as a share of the usual move, at rest
 TINY = 1e-9
 SPIKE = (1, 2)  # samples that a spike may last
 NEARBY = 4  # moves before and after a spike that it is compared with
 RESPONSE = 12  # samples in which an output answers a pulse of an input
-CAUSED = 2.0  # how far a pulse may move an output beyond its share of the range
+CAUSED = 3.0  # how far a pulse may move an output beyond its share of the range
 # What a number in the one unit is in the other: the usual mistakes.
 CONVERSIONS = {
     "degrees Celsius for kelvin": lambda v: v + 273.15,
@@ -181,19 +182,26 @@ def _outside(
 def _frozen(tag: str, values: Array, row: NDArray, params: QualityParams, found: list[Finding]) -> None:
     """A sensor that repeats the very same value for long is frozen: all but the first become missing.
 
-    Long is what chance would hardly bring about, given how often two values are the same elsewhere; of a coarse signal, which
-    stays the same as often as not, a repetition says nothing.
+    Long is what chance would hardly bring about, given how often two values are the same elsewhere. A signal that stays the same as
+    often as not is coarse, and one that hardly moved before is at rest: there a repetition says nothing.
     """
-    move = np.diff(values, prepend=np.nan)
-    same = move == 0
-    long = _long_runs(same, params.frozen - 1)
-    elsewhere = np.isfinite(move) & ~long
-    share = max(float(same[elsewhere].mean()), TINY) if elsewhere.any() else TINY
-    if share > COARSE:
-        found += finding("equal values", tag, _rows(row, long), "kept: the signal is coarse")
-        return
+    move = np.abs(np.diff(values, prepend=np.nan))
+    same, known = move == 0, np.isfinite(move)
+    elsewhere = known & ~_long_runs(same, params.frozen - 1)
+    share = float(np.clip(same[elsewhere].mean(), TINY, COARSE)) if elsewhere.any() else TINY
     least = max(params.frozen, 1 + int(np.ceil(np.log(BY_CHANCE / len(values)) / np.log(share))))
     frozen = _long_runs(same, least - 1)
+    at_rest = AT_REST * float(np.median(move[move > 0])) if (move > 0).any() else 0.0
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], frozen, [False]]).astype(np.int8)))
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        near = slice(max(0, first - BEFORE), first)
+        before = move[near][known[near]]
+        if share == COARSE or (len(before) and np.median(before) < at_rest):
+            frozen[first:last] = False
+        else:
+            known[first:last] = False  # says nothing about what follows
+    equal = _long_runs(same, least - 1) & ~frozen
+    found += finding("equal values", tag, _rows(row, equal), "kept: the signal is coarse or at rest")
     found += finding("frozen sensor", tag, _rows(row, frozen), f"{least} or more equal values: all but the first missing")
     values[frozen] = np.nan
 

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from helpers.evidence.readings import MAIN
-from helpers.report import drawings, figures, limits_findings, limits_report, scorecard, statistics, tables
+from helpers.report import drawings, figures, limits_report, scorecard, statistics, tables
 from helpers.report.collection import ONLINE, Results
 from helpers.runs.artifacts import ArtifactError, code_revision
 from helpers.runs.identity import digest, versions
@@ -251,7 +251,7 @@ def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapp
         published=results.published,
         benchmarks=benchmarks,
         claims=scorecard.verdicts_of_claims(results.claims),
-        limits=limits_findings.find(results),
+        limits=limits_report.find(results),
         listing=partial(scorecard.listing, tabulated["comparison"]),
         better=_better(results),
         nearer=scorecard.nearer_to_expert(tabulated["comparison"]),

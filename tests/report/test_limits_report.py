@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from helpers.report import limits_findings, limits_report
+from helpers.report import limits_report
 from helpers.report.collection import LIMITS
 from helpers.report.report import stacked
 from helpers.report.tables import to_markdown
@@ -70,7 +70,7 @@ def write(folder, level):
 def test_nothing_where_it_was_not_run(results):
     assert limits_report.tabulate(results(1, written=False)) == {}
     assert limits_report.draw(results(1, written=False)) == {}
-    assert limits_findings.find(results(1, written=False)) == {}
+    assert limits_report.find(results(1, written=False)) == {}
 
 
 def test_one_seed_shows_its_monte_carlo_interval(results):
@@ -124,8 +124,8 @@ def test_the_papers_way_beside_its_rivals(results):
     assert budget.loc[("I", "PPO from scratch"), "least to greatest at the end"] == "10.00 to 12.00"
     pairs = limits_report.tabulate(results(1))["limits_pairs"].set_index(["case", "rival"])
     assert pairs.loc[("I", "PPO from scratch")].tolist() == ["14.00", "2.00"]
-    assert limits_findings.standings(results(1)) == {}
-    assert limits_findings.standings(results(5)) == {0: {"ppo": {"ahead": [1, 2]}}, 500: {"ppo": {"ahead": [1, 2]}}}
+    assert limits_report.standings(results(1)) == {}
+    assert limits_report.standings(results(5)) == {0: {"ppo": {"ahead": [1, 2]}}, 500: {"ppo": {"ahead": [1, 2]}}}
 
 
 def test_the_plants_that_were_improved_on(results):
@@ -135,13 +135,13 @@ def test_the_plants_that_were_improved_on(results):
 
 def test_where_improving_on_the_plant_beats_who_does_not_know_it(results):
     """It reaches 10 to 14 in Case I and 20 to 24 in Case II; minimum variance has 15 there, the MPC of the grid 18."""
-    assert limits_findings.there(results(4)) == {}  # too few for an interval
+    assert limits_report.there(results(4)) == {}  # too few for an interval
     behind = ["offset-free MPC", "minimum variance on y"]
-    assert limits_findings.there(results(5)) == {"A x 1.3, B x 0.7": {1: behind, 2: []}}
+    assert limits_report.there(results(5)) == {"A x 1.3, B x 0.7": {1: behind, 2: []}}
 
 
 def test_what_a_practitioner_reads(results):
-    found = limits_findings.answers(results(3))
+    found = limits_report.answers(results(3))
     assert "after 500 episodes IRL, then REINFORCE is best, $J$ = 13.0" in found[1]
     assert "passes offset-free MPC at none of these budgets" in found[1]
     assert "passes offset-free MPC from 500 episodes on" in found[2]
@@ -149,7 +149,7 @@ def test_what_a_practitioner_reads(results):
 
 def test_with_seeds_enough_only_whole_intervals_count(results):
     """Of seeds 0 to 4 the paper's way ends at 12 to 16 in Case I and at 22 to 26 in Case II, PPO two below it, the MPC has 19."""
-    found = limits_findings.answers(results(5))
+    found = limits_report.answers(results(5))
     assert "after 500 episodes IRL, then REINFORCE, $J$ = 14.0 (ahead of all others)" in found[1]
     assert "by the whole interval: after 500 none." in found[1]
     assert "by the whole interval: after 500 IRL, then REINFORCE, PPO from scratch." in found[2]
@@ -162,7 +162,7 @@ def test_learners_that_cannot_be_told_apart():
     reached = (("ppo", 2.0), ("mpc", 1.0))
     rows = [(seed, name, value + seed) for seed in range(5) for name, value in (*reached, ("scratch_reinforce", 1.0 + seed))]
     listed = pd.DataFrame(rows, columns=["seed", "learner", 100]).set_index(["seed", "learner"])
-    told = limits_findings._answer_over_seeds(own, listed)
+    told = limits_report._answer_over_seeds(own, listed)
     assert "after 100 episodes REINFORCE from scratch, $J$ = 5.0 (not to be told apart from PPO from scratch)" in told
     assert "by the whole interval: after 100 PPO from scratch." in told  # the other one is no better than the MPC with seed 0
 
@@ -170,29 +170,29 @@ def test_learners_that_cannot_be_told_apart():
 def test_plants_that_cannot_hold_the_set_point_are_left_out(results):
     """With A doubled, or times 1.3 and B times 0.7, the inputs that hold the set point of Case II lie above their bounds."""
     run = results(1)
-    assert limits_findings.left_out(run) == {"model": {2: (2, 3)}}
-    assert limits_findings.out_of_reach(run) == {"A x 1.3, B x 0.7": [2]}
+    assert limits_report.left_out(run) == {"model": {2: (2, 3)}}
+    assert limits_report.out_of_reach(run) == {"A x 1.3, B x 0.7": [2]}
     kept = limits_report.worst(run).query("group == 'model'").set_index(["case", "controller"])["value"]
     assert (kept[1, "online"], kept[2, "online"]) == (50.0, 80.0)
 
 
 def test_what_is_attainable(results):
     run = results(1)
-    assert limits_findings.seeds(run) == {1: 1, 2: 1}
-    assert limits_findings.attainable(run)[2] == pytest.approx({"look_ahead": 1.0, "noise": 5.0, "filter": 2.5})
-    assert limits_findings.agreement(run) == pytest.approx(0.2)  # of the last grid only
+    assert limits_report.seeds(run) == {1: 1, 2: 1}
+    assert limits_report.attainable(run)[2] == pytest.approx({"look_ahead": 1.0, "noise": 5.0, "filter": 2.5})
+    assert limits_report.agreement(run) == pytest.approx(0.2)  # of the last grid only
 
 
 def test_what_the_searches_for_gains_came_to(results):
     """They end at 5 to 7 in Case I and at 10 to 12 in Case II, from 10."""
-    found = limits_findings.tuned(results(3))
+    found = limits_report.tuned(results(3))
     assert found[1] == {"better": 0, "seeds": 3, "least": 5.0, "greatest": 6.0}
     assert found[2] == {"better": 1, "seeds": 3, "least": 10.0, "greatest": 11.0}
-    assert limits_findings.visited(results(1)) == [400]
+    assert limits_report.visited(results(1)) == [400]
 
 
 def test_what_helps_to_choose(results):
-    found = limits_findings.practice(results(1))
+    found = limits_report.practice(results(1))
     assert found["model_ahead"] == [1]  # 18 against 12 and 22
     assert found["never_below"] == ["offset-free MPC"]
     assert found["least"] == (40.0, 40.0)
@@ -200,17 +200,17 @@ def test_what_helps_to_choose(results):
 
 
 def test_loops_that_a_learner_never_found(results):
-    assert limits_findings.not_found(results(1)) == {case: ["PPO from scratch ($C_A^*$)"] for case in (1, 2)}
+    assert limits_report.not_found(results(1)) == {case: ["PPO from scratch ($C_A^*$)"] for case in (1, 2)}
 
 
 def test_the_ranges_of_the_grids(results):
-    assert limits_findings.ranges(results(1)) == (
+    assert limits_report.ranges(results(1)) == (
         "A and B times 1 to 2 and 0.7 to 1; the set points of the two loops times 1.25 to 1.25 and 1 to 1"
     )
 
 
 def test_the_price_of_improving(results):
-    found = limits_findings.price(results(1))
+    found = limits_report.price(results(1))
     assert found[1]["worse"] == 50.0
     assert found[2]["model"] == 80.0
 
@@ -223,7 +223,7 @@ def test_the_section_of_the_template(results):
     environment = Environment(loader=FileSystemLoader("."), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"table": to_markdown, "numeral": lambda case: "I" * case, "stacked": stacked}
     run = results(1)
-    found = limits_findings.find(run) | {"there": {"A x 1.3, B x 0.7": {1: ["offset-free MPC"], 2: []}}}
+    found = limits_report.find(run) | {"there": {"A x 1.3, B x 0.7": {1: ["offset-free MPC"], 2: []}}}
     shown = {"tables": limits_report.tabulate(run), "limits": found, "n_seeds": 1, "beta": "30"}
     rendered = environment.from_string(section).render(shown)
     assert "10.0 [9.0, 11.0]" in rendered

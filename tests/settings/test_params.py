@@ -6,10 +6,12 @@ import shutil
 import pytest
 from ruamel.yaml import YAML
 
-from helpers.settings.leaf import LEAF_KEYS, STATUSES, ParameterError
+from helpers.settings.leaf import DEVIATION, LEAF_KEYS, STATUSES, ParameterError
+from helpers.settings.limits import load_limits
 from helpers.settings.paper import Params, load, load_published
 
 DELETE = "delete this key"
+GAINS = ("proportional", "integral", "derivative")
 FILES = ("process.yaml", "demonstrators.yaml", "features.yaml", "learning.yaml", "case_1.yaml")
 
 
@@ -35,10 +37,15 @@ def edit(path, changes):
     yaml.dump(content, path)
 
 
-def refusal(folder, case=1):
+def leaf(value, unit="-"):
+    """An entry of a parameter file."""
+    return {"value": value, "unit": unit, "source": "a test", "status": "assumed"}
+
+
+def refusal(folder, case=1, read=load):
     """The sentence with which the parameters are refused."""
     with pytest.raises(ParameterError) as caught:
-        load(folder, case)
+        read(folder, case)
     sentence = str(caught.value)
     assert "\n" not in sentence, sentence
     assert "key ''" not in sentence, sentence
@@ -105,19 +112,13 @@ def test_records_are_frozen(root):
 def test_scale_of_error(folder, error_scale, expected):
     changes = {"set_point.value": [1.0, 4.0], "steady_state.value": [-1.0, -1.0]}
     if error_scale is not DELETE:
-        changes["error_scale"] = {
-            "value": error_scale,
-            "unit": "deviation, unit not given",
-            "source": "a test",
-            "status": "assumed",
-        }
+        changes["error_scale"] = leaf(error_scale, DEVIATION)
     edit(folder / "case_1.yaml", changes)
     assert load(folder, 1).case.scale_of_error == expected
 
 
 def test_a_set_point_at_rest_is_fine_with_an_error_scale(folder):
-    scale = {"value": [1.0, 4.0], "unit": "deviation, unit not given", "source": "a test", "status": "assumed"}
-    edit(folder / "case_1.yaml", {"set_point.value": [0.0, 4.0], "error_scale": scale})
+    edit(folder / "case_1.yaml", {"set_point.value": [0.0, 4.0], "error_scale": leaf([1.0, 4.0], DEVIATION)})
     assert load(folder, 1).case.scale_of_error == (1.0, 4.0)
 
 
@@ -136,7 +137,7 @@ def test_three_loops_need_no_change_of_code(folder):
             "balance": DELETE,
         },
     )
-    edit(folder / "demonstrators.yaml", {f"PID1.{gain}.value": three for gain in ("proportional", "integral", "derivative")})
+    edit(folder / "demonstrators.yaml", {f"PID1.{gain}.value": three for gain in GAINS})
     edit(folder / "learning.yaml", {"policy.error_unit.value": three})
     edit(folder / "case_1.yaml", {f"{name}.value": three for name in ("set_point", "initial_mean", "initial_std")})
     edit(folder / "case_1.yaml", {"steady_state.value": [0.0, 0.0, 0.0]})
@@ -217,56 +218,6 @@ VALUES = [
 ]
 
 
-@pytest.mark.parametrize(("file", "key", "value", "says"), VALUES, ids=[f"{key}={value}" for _, key, value, _ in VALUES])
-def test_a_wrong_value_is_named(folder, file, key, value, says):
-    edit(folder / file, {key: value})
-    sentence = refusal(folder)
-    last = key.removesuffix(".value").split(".")[-1]
-    assert file in sentence, sentence
-    assert last in sentence, sentence
-    assert says in sentence, sentence
-
-
-def test_three_vectors_of_another_length_are_refused(folder):
-    edit(
-        folder / "demonstrators.yaml",
-        {f"PID1.{gain}.value": [1.0, 2.0, 3.0] for gain in ("proportional", "integral", "derivative")},
-    )
-    sentence = refusal(folder)
-    assert "demonstrators.yaml" in sentence
-    assert "PID1.proportional" in sentence
-    assert "expected 2" in sentence
-
-
-def test_as_many_inputs_as_loops(folder):
-    changes = {f"{name}.value": ["a"] for name in ("manipulated", "manipulated_description")}
-    edit(
-        folder / "process.yaml",
-        {**changes, "input_low.value": [-1.0], "input_high.value": [1.0], "drift_input.value": [[1.0], [1.0]]},
-    )
-    sentence = refusal(folder)
-    assert "process.yaml" in sentence
-    assert "'manipulated'" in sentence
-
-
-@pytest.mark.parametrize("rest", [[-1.0, 0.0], [0.0, 4.0]])
-def test_an_error_without_a_scale_is_refused(folder, rest):
-    edit(folder / "case_1.yaml", {"steady_state.value": rest})
-    sentence = refusal(folder)
-    assert "case_1.yaml" in sentence
-    assert "'set_point'" in sentence
-    assert "error_scale" in sentence
-
-
-@pytest.mark.parametrize("scale", [[0.0, 4.0], [1.0], ["1", 4.0]])
-def test_an_error_scale_is_checked(folder, scale):
-    entry = {"value": scale, "unit": "deviation, unit not given", "source": "a test", "status": "assumed"}
-    edit(folder / "case_1.yaml", {"error_scale": entry})
-    sentence = refusal(folder)
-    assert "case_1.yaml" in sentence
-    assert "error_scale" in sentence
-
-
 # Mistakes in a leaf
 
 LEAVES = [
@@ -284,24 +235,6 @@ LEAVES = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "says"), LEAVES, ids=[str(list(changes)) + says for changes, says in LEAVES])
-def test_a_wrong_leaf_is_named(folder, changes, says):
-    edit(folder / "process.yaml", {f"sampling_time.{key}": value for key, value in changes.items()})
-    sentence = refusal(folder)
-    assert "process.yaml" in sentence, sentence
-    assert "'sampling_time'" in sentence, sentence
-    assert says in sentence, sentence
-
-
-@pytest.mark.parametrize("entry", [0.04, None, [0.04], "0.04"], ids=str)
-def test_a_bare_value_is_not_a_leaf(folder, entry):
-    edit(folder / "process.yaml", {"sampling_time": entry})
-    sentence = refusal(folder)
-    assert "process.yaml" in sentence
-    assert "'sampling_time'" in sentence
-    assert "value, unit, source, status" in sentence
-
-
 # Mistakes in the keys
 
 KEYS = [
@@ -316,22 +249,66 @@ KEYS = [
 ]
 
 
-@pytest.mark.parametrize(("file", "key"), KEYS)
-def test_a_missing_key_is_named(folder, file, key):
-    edit(folder / file, {key: DELETE})
-    sentence = refusal(folder)
-    assert file in sentence
-    assert f"'{key}'" in sentence
-    assert "missing" in sentence
+BARE = [0.04, None, [0.04], "0.04"]  # values that are no leaves
+
+OTHERS = [
+    ("demonstrators.yaml", {f"PID1.{gain}.value": [1.0, 2.0, 3.0] for gain in GAINS}, "PID1.proportional", "expected 2"),
+    (
+        "process.yaml",
+        {f"{name}.value": ["a"] for name in ("manipulated", "manipulated_description")}
+        | {"input_low.value": [-1.0], "input_high.value": [1.0], "drift_input.value": [[1.0], [1.0]]},
+        "'manipulated'",
+        "a PID pairs 2 loops",
+    ),
+    *(("case_1.yaml", {"steady_state.value": rest}, "'set_point'", "error_scale") for rest in ([-1.0, 0.0], [0.0, 4.0])),
+    *(("case_1.yaml", {"error_scale": leaf(scale, DEVIATION)}, "error_scale", "") for scale in ([0.0, 4.0], [1.0], ["1", 4.0])),
+]
+
+MISTAKES = [
+    *((file, {key: value}, key.removesuffix(".value").split(".")[-1], says) for file, key, value, says in VALUES),
+    *(
+        ("process.yaml", {f"sampling_time.{key}": value}, "'sampling_time'", says)
+        for part, says in LEAVES
+        for key, value in part.items()
+    ),
+    *(("process.yaml", {"sampling_time": entry}, "'sampling_time'", "value, unit, source, status") for entry in BARE),
+    *((file, {key: DELETE}, f"'{key}'", "missing") for file, key in KEYS),
+    *((file, {f"{key}_": leaf(1)}, f"'{key}_'", "unknown") for file, key in KEYS),
+    *OTHERS,
+]
 
 
-@pytest.mark.parametrize(("file", "key"), [(file, f"{key}_") for file, key in KEYS])
-def test_an_unknown_key_is_named(folder, file, key):
-    edit(folder / file, {key: {"value": 1, "unit": "-", "source": "a test", "status": "assumed"}})
+@pytest.mark.parametrize(("file", "changes", "key", "says"), MISTAKES, ids=[f"{file} {changes}" for file, changes, *_ in MISTAKES])
+def test_a_mistake_is_named(folder, file, changes, key, says):
+    edit(folder / file, changes)
     sentence = refusal(folder)
-    assert file in sentence
-    assert f"'{key}'" in sentence
-    assert "unknown" in sentence
+    assert all(part in sentence for part in (file, key, says)), sentence
+
+
+LIMITS = [
+    ("attainable.nodes", 0, "attainable.nodes"),
+    ("quality.order", 150, "'quality.order': needs more than twice as many samples as 'scales.smoke.at_rest'"),
+    ("quality.n_last", 51, "'quality.n_last': exceeds the horizon of 50 samples"),
+    ("scales.smoke.states", [11], "'states' and 'inputs' differ"),
+    ("scales.smoke.listed", [0, 70], "multiples of 'every'"),
+    ("robustness.improve_state", [1.3], "'improve_state' and 'improve_input' differ"),
+    ("robustness.load", "much", "robustness.load"),
+]
+
+
+@pytest.mark.parametrize(("key", "value", "says"), LIMITS)
+def test_a_mistake_in_the_limits_is_named(folder, key, value, says):
+    edit(folder / "limits.yaml", {f"{key}.value": value})
+    sentence = refusal(folder, read=lambda root, case: load_limits(root, load(root, case)))
+    assert "limits.yaml" in sentence
+    assert says in sentence
+
+
+@pytest.mark.parametrize("case", [1, 2, 3])
+def test_the_committed_limits_fit_every_case(root, case):
+    record = load_limits(root, load(root, case))
+    assert {"paper", "smoke"} <= set(record.scales)
+    assert record.attainable.betas == (10.0, 30.0)
 
 
 @pytest.mark.parametrize("file", FILES)
@@ -345,21 +322,15 @@ def test_a_duplicate_key_is_named(folder, file):
     assert "duplicate" in sentence
 
 
-def test_a_duplicate_key_in_a_leaf_is_named(folder):
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [("beta: {value: 10.0", "beta: {value: 9.0, value: 10.0", ('"value"', "duplicate")), ("beta:", "7: 1\nbeta:", ("key '7'",))],
+)
+def test_a_key_that_stands_twice_in_a_leaf_or_is_no_word_is_named(folder, old, new, says):
     path = folder / "features.yaml"
-    path.write_text(path.read_text().replace("beta: {value: 10.0", "beta: {value: 9.0, value: 10.0"))
+    path.write_text(path.read_text().replace(old, new, 1))
     sentence = refusal(folder)
-    assert "features.yaml" in sentence
-    assert '"value"' in sentence
-    assert "duplicate" in sentence
-
-
-def test_a_key_that_is_no_word_is_refused(folder):
-    path = folder / "features.yaml"
-    path.write_text(path.read_text() + "7: 1\n")
-    sentence = refusal(folder)
-    assert "features.yaml" in sentence
-    assert "7" in sentence
+    assert all(part in sentence for part in ("features.yaml", *says)), sentence
 
 
 # Files that are no parameter files
@@ -419,22 +390,22 @@ PUBLISHED = [
 ]
 
 
+def published(folder, _):
+    return load_published(folder)
+
+
 @pytest.mark.parametrize(("changes", "key"), PUBLISHED, ids=[str(changes) for changes, _ in PUBLISHED])
 def test_a_wrong_published_table_is_named(folder, changes, key):
     edit(folder / "published.yaml", changes)
-    with pytest.raises(ParameterError) as caught:
-        load_published(folder)
-    assert "published.yaml" in str(caught.value)
-    assert key in str(caught.value)
-    assert "\n" not in str(caught.value)
+    sentence = refusal(folder, read=published)
+    assert "published.yaml" in sentence
+    assert key in sentence
 
 
 @pytest.mark.parametrize("name", ["empty", "a list", "binary", "control characters"])
 def test_a_damaged_published_file_is_named(folder, name):
     (folder / "published.yaml").write_bytes(CONTENTS[name])
-    with pytest.raises(ParameterError, match=r"published\.yaml") as caught:
-        load_published(folder)
-    assert "\n" not in str(caught.value)
+    assert "published.yaml" in refusal(folder, read=published)
 
 
 def test_a_case_of_your_own_has_no_published_table(root):

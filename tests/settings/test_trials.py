@@ -11,13 +11,9 @@ from helpers.runs.request import SessionError, check_parameters
 from helpers.settings.leaf import read_yaml
 from helpers.settings.paper import TrialParams, load, load_trials
 from tests.runs.test_study import session
-from tests.settings.test_params import DELETE, edit, folder, refusal  # noqa: F401  (a fixture)
+from tests.settings.test_params import DELETE, edit, folder, leaf, refusal  # noqa: F401  (a fixture)
 
 TRIALS = "trials.yaml"
-
-
-def leaf(value, unit="-"):
-    return {"value": value, "unit": unit, "source": "a test", "status": "assumed"}
 
 
 def test_every_family_has_a_trial_and_every_trial_a_title_of_its_own(root):

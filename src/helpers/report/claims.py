@@ -13,11 +13,10 @@ from typing import Annotated, Literal, Self
 import numpy as np
 import pandas as pd
 from pydantic import Field, StringConstraints, model_validator
-from pydantic_core import PydanticCustomError
 
 from helpers.report.statistics import FEWEST, median_interval
 from helpers.runs.artifacts import RECORD, load_stage
-from helpers.settings.leaf import Count, Real, Record, Text, read_yaml, validate
+from helpers.settings.leaf import Count, Real, Record, Text, read_yaml, refusal, validate
 
 HOLDS, FAILS, OPEN, NOT_COMPARABLE = "holds", "does not hold", "cannot tell", "not comparable"
 COLUMNS = ("id", "section", "statement", "case", "quantity", "n", "median", "ci_low", "ci_high", "test", "verdict", "reason")
@@ -47,15 +46,14 @@ class Claim(Record):
     def _consistent(self) -> Self:
         if self.test == "not_comparable":
             if self.margin is not None or self.quantities:
-                raise PydanticCustomError("test", "a claim that is not comparable has neither 'margin' nor 'quantities'")
+                raise refusal("a claim that is not comparable has neither 'margin' nor 'quantities'")
             return self
         if self.margin is None or not self.quantities:
-            raise PydanticCustomError("test", "the test '{test}' needs 'margin' and 'quantities'", {"test": self.test})
+            raise refusal(f"the test '{self.test}' needs 'margin' and 'quantities'")
         for name, quantity in self.quantities.items():
             if (quantity.against is None) != self.test.startswith("value"):
                 need = "needs no" if quantity.against else "needs an"
-                values = {"test": self.test, "need": need, "name": name}
-                raise PydanticCustomError("test", "the test '{test}' {need} 'against' in '{name}'", values)
+                raise refusal(f"the test '{self.test}' {need} 'against' in '{name}'")
         return self
 
 
@@ -149,7 +147,7 @@ def verdicts(claims: Mapping[str, Claim], values: pd.DataFrame) -> pd.DataFrame:
     Returns:
         Columns `COLUMNS`; median and interval are those of what the test compares with the margin.
     """
-    table = values.pivot_table(index=["case", "quantity"], columns="seed", values="value", aggfunc="first") if len(values) else None
+    table = values.pivot_table(index=["case", "quantity"], columns="seed", values="value", aggfunc="first")
     rows = []
     for name, claim in claims.items():
         for case in claim.cases:
@@ -167,13 +165,7 @@ def rule_in_words(claim: Claim) -> str:
     return words if claim.margin is None else f"{words} {claim.margin:g}"
 
 
-def _paired(table: pd.DataFrame | None, case: int, quantity: Quantity | None) -> pd.DataFrame:
-    """The values of a quantity by seed, beside what it is compared with."""
-    columns = {}
-    for name in ("value", "against"):
-        reference = getattr(quantity, name, None)
-        if table is not None and (case, reference) in table.index:
-            columns[name] = table.loc[(case, reference)]
-        else:
-            columns[name] = pd.Series(dtype=float)
-    return pd.DataFrame(columns)
+def _paired(table: pd.DataFrame, case: int, quantity: Quantity | None) -> pd.DataFrame:
+    """The values of a quantity by seed, beside what it is compared with; nan where they were not run."""
+    names = ("value", "against")
+    return pd.DataFrame({name: table.reindex([(case, getattr(quantity, name, None))]).iloc[0] for name in names})

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -287,6 +288,15 @@ def empty_figure(width: float, height: float) -> Figure:
     figure = plt.figure(figsize=(width, height), layout="constrained")
     plt.close(figure)
     return figure
+
+
+def lay_out(figure: Figure) -> None:
+    """Lay a figure out for a file of vectors, once and for all: with a layout engine, every file of it would be drawn twice."""
+    if (engine := figure.get_layout_engine()) is not None:
+        FigureCanvasSVG(figure)
+        figure.set_dpi(72)  # as an SVG has it
+        engine.execute(figure)
+        figure.set_layout_engine(None)
 
 
 def _draw_response(axes: Axes, response: pd.DataFrame, variable: str, set_point: float | None = None) -> None:

@@ -10,6 +10,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from seaborn import heatmap
 
 from helpers.report.figures import INK, KIND_STYLES, LOOP_COLOURS, MUTED, WIDTH, empty_figure
 
@@ -104,23 +105,19 @@ def heat_maps(robustness: pd.DataFrame, group: str, controllers: Sequence[str]) 
     found = robustness[robustness["group"] == group]
     rows, columns = list(dict.fromkeys(found["row"])), list(dict.fromkeys(found["column"]))
     table = found.pivot_table(index=["controller", "row"], columns="column", values="objective", sort=False)
-    reference = table.loc["expert"].loc[rows, columns].to_numpy()
+    reference = table.loc["expert"].loc[rows, columns]
     across = 3
     down = -(-len(controllers) // across)
     figure = empty_figure(WIDTH, 0.9 + down * (0.55 + 0.26 * len(rows)))
     norm, colours = TwoSlopeNorm(100, 40, 160), "PuOr"
     for index, name in enumerate(controllers):
         axes = figure.add_subplot(down, across, index + 1)
-        values = table.loc[name].loc[rows, columns].to_numpy()
-        share = 100 * values / reference
-        axes.imshow(share, cmap=colours, norm=norm, aspect="auto")
-        for (row, column), value in np.ndenumerate(values):
-            pale = 60 < share[row, column] < 140
-            axes.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=7.5, color=INK if pale else "white")
-        axes.set_xticks(range(len(columns)), columns if index >= len(controllers) - across else [""] * len(columns))
-        axes.set_yticks(range(len(rows)), rows if index % across == 0 else [""] * len(rows))
+        values = table.loc[name].loc[rows, columns]
+        look: Any = {"cmap": colours, "norm": norm, "cbar": False, "annot_kws": {"fontsize": 7.5}}
+        heatmap(100 * values / reference, annot=values, fmt=".1f", ax=axes, **look)
+        axes.set(xlabel="", ylabel="")
+        axes.tick_params(labelbottom=index >= len(controllers) - across, labelleft=index % across == 0, labelrotation=0)
         axes.set_title(LABELS[name], fontsize=9, loc="left")
-        axes.grid(visible=False)
         axes.set_label(f"{name} {group}")
     figure.supxlabel(column_label, fontsize=10)
     figure.supylabel(row_label, fontsize=10)

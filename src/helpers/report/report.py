@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+from base64 import b64decode, b64encode
 from collections.abc import Mapping
 from functools import partial
 from importlib import metadata
@@ -16,9 +17,10 @@ import pandas as pd
 import pypandoc
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
+from PIL import Image
 
 from helpers.evidence.readings import MAIN
-from helpers.report import drawings, figures, limits_findings, limits_report, scorecard, statistics, tables
+from helpers.report import drawings, figures, limits_report, scorecard, statistics, tables
 from helpers.report.collection import ONLINE, Results
 from helpers.runs.artifacts import ArtifactError, code_revision
 from helpers.runs.identity import digest, versions
@@ -30,6 +32,7 @@ from helpers.settings.paper import OnlineParams
 
 RUNNERS = ("papermill", "snakemake", "pypandoc_binary")  # packages that shape no number
 SHOWN_AS_PIXELS = ("figure_3",)  # in README, where a reader without a browser of its own meets it
+PALETTE = 64  # colours of a picture inside a drawing, each with its own opacity
 LONGEST_TWIN = 100  # rows of a table that is written as Markdown too, for reading
 PROVENANCE = "provenance.json"
 OWN_ERROR = "as in the parameter files, with each trajectory's own |e| before the first step"  # what notebook 00 calls its main one
@@ -167,13 +170,13 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
         drawn, origin = draw(results), provenance(results)
         tabulated = tabulate(results) if tabulated is None else tabulated
         for name, figure in drawn.items():
+            figures.lay_out(figure)
             drawing = io.StringIO()
             figure.savefig(drawing, format="svg", metadata={"Date": None})
             (partial / "figures" / f"{name}.svg").write_text(shortened(drawing.getvalue()), encoding="utf-8")
             if name in SHOWN_AS_PIXELS:
-                figure.set_layout_engine("none")  # it stays as the first file was laid out: a layout costs as much as drawing
                 pixels = io.BytesIO()
-                figure.savefig(pixels)
+                figure.savefig(pixels, format="png")
                 (partial / "figures" / f"{name}.png").write_bytes(smaller(pixels.getvalue()))
         for name, frame in tabulated.items():
             frame.to_csv(partial / "tables" / f"{name}.csv", index=False, float_format="%.10g")
@@ -202,8 +205,23 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
 
 
 def shortened(drawing: str) -> str:
-    """An SVG drawing with two decimals in its paths: finer than any screen, and a third smaller."""
-    return re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), drawing)
+    """An SVG drawing in half the bytes, without what no screen shows.
+
+    Coordinates have two decimals, the font is named once, nothing is indented or turned by nought, and the pictures inside have a
+    palette.
+    """
+    drawing = re.sub(r' (?:[dxy]="|transform="[rt])[^"]*"', lambda found: re.sub(r"(\.\d\d)\d+", r"\1", found[0]), drawing)
+    drawing = re.sub(r' transform="rotate\(-?0 [^"]*"|(?<=\n) +', "", drawing)
+    if fonts := re.search(r" font-family: ([^;\"]*);", drawing):
+        drawing = drawing.replace(fonts[0], "").replace("<svg ", f'<svg font-family="{fonts[1]}" ', 1)
+    return re.sub(r'(?<=;base64,)[^"]+', lambda found: b64encode(_with_palette(b64decode(found[0]))).decode(), drawing)
+
+
+def _with_palette(png: bytes) -> bytes:
+    """The PNG with a palette of its own, its transparency kept."""
+    found = io.BytesIO()
+    Image.open(io.BytesIO(png)).convert("RGBA").quantize(PALETTE).save(found, format="PNG", optimize=True)
+    return min(png, found.getvalue(), key=len)
 
 
 def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapping[str, Any]) -> str:
@@ -233,7 +251,7 @@ def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapp
         published=results.published,
         benchmarks=benchmarks,
         claims=scorecard.verdicts_of_claims(results.claims),
-        limits=limits_findings.find(results),
+        limits=limits_report.find(results),
         listing=partial(scorecard.listing, tabulated["comparison"]),
         better=_better(results),
         nearer=scorecard.nearer_to_expert(tabulated["comparison"]),

@@ -19,6 +19,8 @@ from helpers.settings.leaf import (
     Share,
     Text,
     Vector,
+    check_length,
+    check_scales,
     read_yaml,
     validate,
 )
@@ -177,10 +179,7 @@ def load_experiments(root: Path, params: Params) -> ExperimentParams:
         raise ParameterError(f"{path}: key 'demonstrators.by_hand': expected one of {known}, found '{found}'")
     expected = len(params.process.controlled)
     for name in ("initial_shift", "set_point_factor"):
-        value = getattr(record.conditions, name)
-        if len(value) != expected:
-            key = f"conditions.{name}"
-            raise ParameterError(f"{path}: key '{key}': expected {expected} entries, one a variable, found {len(value)}")
+        check_length(path, f"conditions.{name}", getattr(record.conditions, name), expected)
     return record
 
 
@@ -190,10 +189,6 @@ def load_identification(root: Path, params: Params) -> IdentificationParams:
     record = validate(IdentificationParams, read_yaml(path), path)
     expected = len(params.process.controlled)
     for name in ("input_bound", "proportional", "integral", "derivative"):
-        value = getattr(record.search, name)
-        if len(value) != expected:
-            raise ParameterError(f"{path}: key 'search.{name}': expected {expected} entries, one a loop, found {len(value)}")
-    for scale in params.learning.scales:
-        if scale not in record.scales:
-            raise ParameterError(f"{path}: key 'scales.{scale}': the key is missing")
+        check_length(path, f"search.{name}", getattr(record.search, name), expected, "loop")
+    check_scales(path, params.learning.scales, record.scales)
     return record

@@ -6,6 +6,7 @@ expected.
 """
 
 import copy
+from collections.abc import Container, Iterable, Sized
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -20,12 +21,17 @@ from ruamel.yaml.error import YAMLError
 from ruamel.yaml.events import AliasEvent
 
 LEAF_KEYS = ("value", "unit", "source", "status")
-
-
 STATUSES = ("reported", "inferred", "assumed")
-
-
 LONGEST = 200  # characters of a file that a message shows
+EPISODES_PER_EPOCH = 500  # the size of the paper's batch of demonstrations; no epoch may draw more
+DEVIATION = "deviation, unit not given"
+KEY_MESSAGES = {
+    "missing": "the key is missing",
+    "extra_forbidden": "the key is unknown",
+    "tuple_type": "expected a list in brackets",
+    "dict_type": "expected keys and values",
+    "model_type": "expected keys and values",
+}
 
 
 class InputError(ValueError):
@@ -43,6 +49,11 @@ class ParameterError(InputError):
     """A parameter file is unusable; the message names the file and the key."""
 
 
+def refusal(sentence: str) -> PydanticCustomError:
+    """The error by which a record's own check refuses what it was given."""
+    return PydanticCustomError("refused", "{sentence}", {"sentence": sentence})
+
+
 @dataclass(frozen=True)
 class Leaf:
     """Marks a field whose entry in the file is {value, unit, source, status}, with the unit it must be given in."""
@@ -52,23 +63,17 @@ class Leaf:
     def unwrap(self, entry: Any) -> Any:
         """The value of a leaf, once its keys, unit and status are right."""
         if not isinstance(entry, dict):
-            raise PydanticCustomError("leaf", "expected a leaf with the keys value, unit, source, status")
-        for key in LEAF_KEYS:
-            if key not in entry:
-                raise PydanticCustomError("leaf", "the leaf lacks the key '{key}'", {"key": key})
-        for key in entry:
-            if key not in LEAF_KEYS:
-                raise PydanticCustomError("leaf", "the leaf has the unknown key '{key}'", {"key": str(key)})
+            raise refusal("expected a leaf with the keys value, unit, source, status")
+        if missing := [key for key in LEAF_KEYS if key not in entry]:
+            raise refusal(f"the leaf lacks the key '{missing[0]}'")
+        if unknown := [key for key in entry if key not in LEAF_KEYS]:
+            raise refusal(f"the leaf has the unknown key '{unknown[0]}'")
         if entry["unit"] != self.unit:
-            raise PydanticCustomError(
-                "leaf", "expected the unit '{expected}', found '{found}'", {"expected": self.unit, "found": str(entry["unit"])}
-            )
+            raise refusal(f"expected the unit '{self.unit}', found '{entry['unit']}'")
         if entry["status"] not in STATUSES:
-            raise PydanticCustomError(
-                "leaf", "expected a status of reported, inferred, assumed, found '{found}'", {"found": str(entry["status"])}
-            )
+            raise refusal(f"expected a status of {', '.join(STATUSES)}, found '{entry['status']}'")
         if not isinstance(entry["source"], str) or not entry["source"]:
-            raise PydanticCustomError("leaf", "expected a source in words")
+            raise refusal("expected a source in words")
         return entry["value"]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
@@ -77,43 +82,19 @@ class Leaf:
 
 def _not_zero(value: float) -> float:
     if value == 0:
-        raise PydanticCustomError("zero", "expected a number other than zero")
+        raise refusal("expected a number other than zero")
     return value
 
 
-EPISODES_PER_EPOCH = 500  # the size of the paper's batch of demonstrations; no epoch may draw more
-
-
-DEVIATION = "deviation, unit not given"
-
-
 Real = Annotated[float, Strict(), Field(allow_inf_nan=False)]
-
-
 Positive = Annotated[Real, Field(gt=0)]
-
-
 NotNegative = Annotated[Real, Field(ge=0)]
-
-
 Count = Annotated[int, Strict(), Field(gt=0)]
-
-
 Text = Annotated[str, Strict(), Field(min_length=1)]
-
-
 Vector = Annotated[tuple[Real, ...], Field(min_length=1)]
-
-
 Share = Annotated[Positive, Field(le=1)]
-
-
 Memory = Annotated[NotNegative, Field(lt=1)]
-
-
 NotZero = Annotated[Real, AfterValidator(_not_zero)]
-
-
 Matrix = Annotated[tuple[Vector, ...], Field(min_length=1)]
 
 
@@ -123,23 +104,11 @@ class Record(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-def _same_length(expected: int, record: BaseModel, *names: str) -> None:
+def same_length(expected: int, record: BaseModel, *names: str) -> None:
+    """Refuse a record in which one of these fields has not as many entries as expected."""
     for name in names:
-        if len(getattr(record, name)) != expected:
-            raise PydanticCustomError(
-                "length",
-                "'{name}' has {found} entries, expected {expected}",
-                {"name": name, "found": len(getattr(record, name)), "expected": expected},
-            )
-
-
-KEY_MESSAGES = {
-    "missing": "the key is missing",
-    "extra_forbidden": "the key is unknown",
-    "tuple_type": "expected a list in brackets",
-    "dict_type": "expected keys and values",
-    "model_type": "expected keys and values",
-}
+        if (found := len(getattr(record, name))) != expected:
+            raise refusal(f"'{name}' has {found} entries, expected {expected}")
 
 
 R = TypeVar("R", bound=Record)
@@ -206,3 +175,16 @@ def list_leaves(content: Any, file: str, key: str = "") -> list[dict[str, Any]]:
     if isinstance(content, dict):
         return [row for name, entry in content.items() for row in list_leaves(entry, file, f"{key}.{name}".strip("."))]
     return []
+
+
+def check_scales(path: Path, expected: Iterable[str], found: Container[str]) -> None:
+    """Refuse a file that lacks one of the scales of learning.yaml."""
+    for scale in expected:
+        if scale not in found:
+            raise ParameterError(f"{path}: key 'scales.{scale}': the key is missing")
+
+
+def check_length(path: Path, key: str, value: Sized, expected: int, one_a: str = "variable") -> None:
+    """Refuse a vector that does not fit the process of the case."""
+    if len(value) != expected:
+        raise ParameterError(f"{path}: key '{key}': expected {expected} entries, one a {one_a}, found {len(value)}")

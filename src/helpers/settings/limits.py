@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Annotated, Self
 
 from pydantic import Field, Strict, model_validator
-from pydantic_core import PydanticCustomError
 
 from helpers.settings.leaf import (
     Count,
@@ -16,7 +15,9 @@ from helpers.settings.leaf import (
     Record,
     Share,
     Text,
+    check_scales,
     read_yaml,
+    refusal,
     validate,
 )
 from helpers.settings.paper import Params
@@ -92,7 +93,7 @@ class RobustnessParams(Record):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if len(self.improve_state) != len(self.improve_input):
-            raise PydanticCustomError("length", "'improve_state' and 'improve_input' differ in length")
+            raise refusal("'improve_state' and 'improve_input' differ in length")
         return self
 
 
@@ -114,9 +115,9 @@ class LimitsScaleParams(Record):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if len(self.states) != len(self.inputs):
-            raise PydanticCustomError("length", "'states' and 'inputs' differ in length")
+            raise refusal("'states' and 'inputs' differ in length")
         if any(number > self.episodes or number % self.every for number in self.listed):
-            raise PydanticCustomError("listed", "'listed' must hold multiples of 'every' up to 'episodes'")
+            raise refusal("'listed' must hold multiples of 'every' up to 'episodes'")
         return self
 
 
@@ -143,9 +144,7 @@ def load_limits(root: Path, params: Params) -> LimitsParams:
     """
     path = root / "limits.yaml"
     record = validate(LimitsParams, read_yaml(path), path)
-    for scale in params.learning.scales:
-        if scale not in record.scales:
-            raise ParameterError(f"{path}: key 'scales.{scale}': the key is missing")
+    check_scales(path, params.learning.scales, record.scales)
     for name, scale_params in record.scales.items():
         if record.quality.order >= scale_params.at_rest // 2:
             raise ParameterError(f"{path}: key 'quality.order': needs more than twice as many samples as 'scales.{name}.at_rest'")

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, Strict, model_validator
-from pydantic_core import PydanticCustomError
 
 from helpers.settings.leaf import (
     DEVIATION,
@@ -24,9 +23,11 @@ from helpers.settings.leaf import (
     Share,
     Text,
     Vector,
-    _same_length,
+    check_length,
     list_leaves,
     read_yaml,
+    refusal,
+    same_length,
     validate,
 )
 
@@ -64,16 +65,14 @@ class ProcessParams(Record):
     def _consistent(self) -> Self:
         n_states = len(self.controlled)
         n_inputs = len(self.manipulated)
-        _same_length(n_states, self, "controlled_description", "drift_state", "drift_input")
-        _same_length(n_states, self, "disturbance", "observation_noise")
-        _same_length(n_inputs, self, "manipulated_description", "input_low", "input_high")
+        same_length(n_states, self, "controlled_description", "drift_state", "drift_input")
+        same_length(n_states, self, "disturbance", "observation_noise")
+        same_length(n_inputs, self, "manipulated_description", "input_low", "input_high")
         for name, width in (("drift_state", n_states), ("drift_input", n_inputs)):
             if any(len(row) != width for row in getattr(self, name)):
-                raise PydanticCustomError(
-                    "length", "'{name}' has a row whose length is not {width}", {"name": name, "width": width}
-                )
+                raise refusal(f"'{name}' has a row whose length is not {width}")
         if any(low >= high for low, high in zip(self.input_low, self.input_high, strict=True)):
-            raise PydanticCustomError("bounds", "'input_low' must lie below 'input_high' for every input")
+            raise refusal("'input_low' must lie below 'input_high' for every input")
         return self
 
 
@@ -86,7 +85,7 @@ class GainParams(Record):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        _same_length(len(self.proportional), self, "integral", "derivative")
+        same_length(len(self.proportional), self, "integral", "derivative")
         return self
 
 
@@ -109,7 +108,7 @@ class ExplorationParams(Record):
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if not self.std_low <= self.initial_std <= self.std_high or self.std_low == self.std_high:
-            raise PydanticCustomError("std", "expected std_low <= initial_std <= std_high and std_low < std_high")
+            raise refusal("expected std_low <= initial_std <= std_high and std_low < std_high")
         return self
 
 
@@ -137,7 +136,7 @@ class ScaleParams(Record):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.episodes + self.measured > EPISODES_PER_EPOCH:
-            raise PydanticCustomError("epoch", "'episodes' and 'measured' exceed {top} an epoch", {"top": EPISODES_PER_EPOCH})
+            raise refusal(f"'episodes' and 'measured' exceed {EPISODES_PER_EPOCH} an epoch")
         return self
 
 
@@ -172,7 +171,7 @@ class WeightParams(Record):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if not any(self.initial):
-            raise PydanticCustomError("weights", "'initial' holds zeros only, which have no direction")
+            raise refusal("'initial' holds zeros only, which have no direction")
         return self
 
 
@@ -237,7 +236,7 @@ class LearningParams(Record):
         fewest = self.fewest_episodes
         for learner in (self.online.learner, *(variant.learner for variant in self.variants.values())):
             if learner.minibatches > fewest:
-                raise PydanticCustomError("batch", "'minibatches' exceeds the {fewest} episodes of a scale", {"fewest": fewest})
+                raise refusal(f"'minibatches' exceeds the {fewest} episodes of a scale")
         return self
 
 
@@ -251,7 +250,7 @@ class OfflineParams(Record):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.iterations > self.epochs:
-            raise PydanticCustomError("iterations", "'iterations' exceeds 'epochs'")
+            raise refusal("'iterations' exceeds 'epochs'")
         return self
 
 
@@ -264,7 +263,7 @@ class OnlineParams(Record):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        _same_length(len(self.epochs), self, "beta")
+        same_length(len(self.epochs), self, "beta")
         return self
 
 
@@ -284,13 +283,11 @@ class CaseParams(Record):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if len(self.steady_state) != len(self.set_point):
-            raise PydanticCustomError("length", "'set_point' and 'steady_state' differ in length")
+            raise refusal("'set_point' and 'steady_state' differ in length")
         if self.error_scale is not None:
-            _same_length(len(self.set_point), self, "error_scale")
+            same_length(len(self.set_point), self, "error_scale")
         elif any(target == rest for target, rest in zip(self.set_point, self.steady_state, strict=True)):
-            raise PydanticCustomError(
-                "scale", "'set_point' equals 'steady_state' in a loop, so the error has no scale: give 'error_scale'"
-            )
+            raise refusal("'set_point' equals 'steady_state' in a loop, so the error has no scale: give 'error_scale'")
         return self
 
     @property
@@ -311,7 +308,7 @@ class PublishedCase(Record):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        _same_length(len(self.expert), self, "policy", "alpha")
+        same_length(len(self.expert), self, "policy", "alpha")
         return self
 
     @property
@@ -373,8 +370,7 @@ def load(root: Path, case: int) -> Params:
         (root / "learning.yaml", "policy.error_unit", learning.policy.error_unit, n_controlled),
     )
     for path, key, value, expected in lengths:
-        if len(value) != expected:
-            raise ParameterError(f"{path}: key '{key}': expected {expected} entries, one a variable, found {len(value)}")
+        check_length(path, key, value, expected)
     if n_manipulated != n_controlled:
         path = root / "process.yaml"
         raise ParameterError(f"{path}: key 'manipulated': a PID pairs {n_controlled} loops, found {n_manipulated} inputs")

@@ -12,15 +12,11 @@ from helpers.evidence.attainable import Tabulated
 from helpers.learning.evaluation import objective
 from helpers.report import limits_answer
 from helpers.report.limits_figures import LABELS, budget_curves, gap_figure, heat_maps, regret_figure
-from helpers.runs.session import open_session
-from tests.evidence.test_experiments import short
 
 
 @pytest.fixture(scope="module")
-def contest(root, tmp_path_factory):
-    files = short(root, tmp_path_factory.mktemp("files") / "params")
-    given = {"case": 2, "seed": 0, "scale": "smoke", "params_root": str(files), "input_root": "", "output_root": ""}
-    found = limits.enter(open_session("06_limits_and_alternatives", given))
+def contest(short):
+    found = limits.enter(short(2, "06_limits_and_alternatives"))
     small = {"draws": 60, "episodes": 24, "listed": (0, 12, 24), "every": 12, "judged": 20, "grid": 4}
     scale = found.scale.model_copy(update=small)
     params = found.params.model_copy(update={"scales": {"smoke": scale}})

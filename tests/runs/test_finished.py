@@ -149,7 +149,7 @@ def test_a_forged_header_is_refused(kept):
     finished, path = kept
     training = path.read_bytes().split(b'"training":"')[1][:64].decode()
     assert training.startswith(path.stem)
-    save_file(load_file(path), path, {"training": training, "state": json.dumps(["tensor:9"])})
+    save_file(load_file(path), path, {"training": training, "state": json.dumps({"t": {"tensor": "9"}})})
     assert finished.once(lambda: {"fresh": 1}, "b") == {"fresh": 1}
 
 

@@ -65,12 +65,8 @@ def test_a_warning_in_an_executed_copy_names_no_folder_of_the_machine(tmp_path):
 
 
 def test_a_notebook_runs_from_any_directory_and_leaves_no_trace_of_the_machine(here, capfd):
-    arguments = [
-        "01_demonstrations",
-        "copies/01.ipynb",
-        *["-p", "case", "2", "-p", "seed", "5", "-p", "output_root"],
-        str(here / "out"),
-    ]
+    arguments = ["01_demonstrations", "copies/01.ipynb", "-p", "case", "2", "-p", "seed", "5"]
+    arguments += ["-p", "output_root", str(here / "out")]
     assert run.main(arguments) == 0
     assert capfd.readouterr().out.strip() == "done: 01_demonstrations case=2 seed=5"
     stage = load_stage(here / "out/smoke/seed_5/case_2/demonstrations", "notebook 01")

@@ -5,24 +5,10 @@ import torch
 
 from helpers.evidence import alternatives, experiments
 from helpers.evidence.alternatives import SomeFeatures, conditions, first, miss_by_hand
-from helpers.evidence.experiments import prepare
 from helpers.plant.controllers import Operator
 from helpers.plant.task import Trajectories
 from helpers.report.claims import load_claims
-from helpers.runs.session import open_session
 from helpers.runs.study import score_table
-from tests.evidence.test_experiments import short
-
-
-@pytest.fixture(scope="module")
-def prepared(root, tmp_path_factory):
-    files = short(root, tmp_path_factory.mktemp("files") / "params")
-
-    def build(case=1):
-        given = {"case": case, "seed": 0, "scale": "smoke", "params_root": str(files), "input_root": "", "output_root": ""}
-        return prepare(open_session("08_claims", given))
-
-    return build
 
 
 @pytest.mark.parametrize("case", [*(pytest.param(case, marks=pytest.mark.torture) for case in (1, 2)), 3])

@@ -1,11 +1,9 @@
 """The extra runs: their pieces by hand, and that they give every number which the claims ask for."""
 
-import shutil
 from dataclasses import replace
 
 import pytest
 import torch
-from ruamel.yaml import YAML
 
 from helpers.evidence import experiments
 from helpers.evidence.experiments import attempt, first_epoch, plan, prepare, response_figures
@@ -13,32 +11,6 @@ from helpers.plant.task import Trajectories
 from helpers.runs.session import open_session
 
 STREAMS = {"input_root": "", "output_root": ""}
-
-
-def short(root, folder):
-    """Parameter files with one epoch and few trajectories."""
-    shutil.copytree(root, folder)
-    yaml = YAML(typ="safe", pure=True)
-    path = folder / "learning.yaml"
-    content = yaml.load(path)
-    for name, value in {"epoch_share": 0.001, "episodes": 4, "measured": 2, "evaluation": 20, "expert_evaluation": 20}.items():
-        content["scales"]["smoke"][name]["value"] = value
-    yaml.dump(content, path)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def files(root, tmp_path_factory):
-    return short(root, tmp_path_factory.mktemp("files") / "params")
-
-
-@pytest.fixture(scope="module")
-def prepared(files):
-    def build(case=1):
-        given = {"case": case, "seed": 0, "scale": "smoke", "params_root": str(files), **STREAMS}
-        return prepare(open_session("08_claims", given))
-
-    return build
 
 
 def trajectories(session, errors):

@@ -1,5 +1,7 @@
 """The gymnasium environment against this project's own rollout, and learners of libraries as controllers of this project."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -118,7 +120,7 @@ def test_an_interrupted_run_does_not_repeat_a_learner_that_has_ended(root, tmp_p
     given = {"case": 2, "seed": 0, "scale": "smoke", "params_root": str(root), "input_root": "", "output_root": str(tmp_path)}
     contest = limits.enter(open_session("06_limits_and_alternatives", given))
     scale = contest.scale.model_copy(update={"episodes": 100, "every": 50, "judged": 20})
-    contest = equal_budget.Contest(contest.prepared, contest.params.model_copy(update={"scales": {"smoke": scale}}))
+    contest = replace(contest, limits=contest.limits.model_copy(update={"scales": {"smoke": scale}}))
     first = equal_budget.from_library(contest, name)
     monkeypatch.setattr("helpers.evidence.library_learners.learn", None)
     again = equal_budget.from_library(contest, name)

@@ -12,20 +12,16 @@ from helpers.evidence.attainable import Tabulated
 from helpers.learning.evaluation import objective
 from helpers.report import limits_answer
 from helpers.report.limits_figures import LABELS, budget_curves, gap_figure, heat_maps, regret_figure
-from helpers.runs.session import open_session
-from tests.evidence.test_experiments import short
 
 
 @pytest.fixture(scope="module")
-def contest(root, tmp_path_factory):
-    files = short(root, tmp_path_factory.mktemp("files") / "params")
-    given = {"case": 2, "seed": 0, "scale": "smoke", "params_root": str(files), "input_root": "", "output_root": ""}
-    found = limits.enter(open_session("06_limits_and_alternatives", given))
+def contest(short):
+    found = limits.enter(short(2, "06_limits_and_alternatives"))
     small = {"draws": 60, "episodes": 24, "listed": (0, 12, 24), "every": 12, "judged": 20, "grid": 4}
     scale = found.scale.model_copy(update=small)
-    params = found.params.model_copy(update={"scales": {"smoke": scale}})
+    params = found.limits.model_copy(update={"scales": {"smoke": scale}})
     params = params.model_copy(update={"tuning": params.tuning.model_copy(update={"episodes": 1})})
-    return equal_budget.Contest(found.prepared, params)
+    return replace(found, limits=params)
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +121,7 @@ def test_the_scorecard_holds_every_figure_of_every_controller(contest, attained)
 def everywhere(contest):
     """The contest under every condition, as at paper scale."""
     scale = contest.scale.model_copy(update={"corners": False})
-    return replace(contest, params=contest.params.model_copy(update={"scales": {contest.session.scale: scale}}))
+    return replace(contest, limits=contest.limits.model_copy(update={"scales": {contest.session.scale: scale}}))
 
 
 def test_conditions_differ_in_what_they_name(contest):

@@ -62,12 +62,6 @@ def test_no_name_of_a_trial_can_lead_out_either(tmp_path):
             check_parameters("02_offline_irl", {"params_root": str(tmp_path)})
 
 
-@pytest.mark.parametrize("place", ["src", "notebooks/inputs", ".git", "results/../params", "reports/../../{name}/src", "."])
-def test_no_result_goes_where_the_project_keeps_what_it_is_made_of(place):
-    with pytest.raises(SessionError, match="inside the project results go below"):
-        check_place("output_root", PROJECT / place.format(name=PROJECT.name))
-
-
 def test_results_reports_and_folders_elsewhere_are_accepted(tmp_path):
     for place in (PROJECT / "results", PROJECT / "reports/latest/notebooks/05.ipynb", tmp_path, tmp_path / "src"):
         check_place("output_root", place)

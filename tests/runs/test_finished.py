@@ -49,7 +49,7 @@ def frozen(opened):
 def budgeted(opened):
     contest = limits.enter(opened)
     small = contest.scale.model_copy(update={"episodes": 200, "every": 50, "judged": 10})
-    contest = replace(contest, params=contest.params.model_copy(update={"scales": {"smoke": small}}))
+    contest = replace(contest, limits=contest.limits.model_copy(update={"scales": {"smoke": small}}))
     result = equal_budget.reinforced(contest, opened.fresh_policy(), "scratch", True)
     return result.curve, 0, list(result.build.args[0].state_dict().values())
 
@@ -149,7 +149,7 @@ def test_a_forged_header_is_refused(kept):
     finished, path = kept
     training = path.read_bytes().split(b'"training":"')[1][:64].decode()
     assert training.startswith(path.stem)
-    save_file(load_file(path), path, {"training": training, "state": json.dumps(["tensor:9"])})
+    save_file(load_file(path), path, {"training": training, "state": json.dumps({"t": {"tensor": "9"}})})
     assert finished.once(lambda: {"fresh": 1}, "b") == {"fresh": 1}
 
 

@@ -65,19 +65,8 @@ def test_a_warning_in_an_executed_copy_names_no_folder_of_the_machine(tmp_path):
 
 
 def test_a_notebook_runs_from_any_directory_and_leaves_no_trace_of_the_machine(here, capfd):
-    arguments = [
-        "01_demonstrations",
-        "copies/01.ipynb",
-        "-p",
-        "case",
-        "2",
-        "-p",
-        "seed",
-        "5",
-        "-p",
-        "output_root",
-        str(here / "out"),
-    ]
+    arguments = ["01_demonstrations", "copies/01.ipynb", "-p", "case", "2", "-p", "seed", "5"]
+    arguments += ["-p", "output_root", str(here / "out")]
     assert run.main(arguments) == 0
     assert capfd.readouterr().out.strip() == "done: 01_demonstrations case=2 seed=5"
     stage = load_stage(here / "out/smoke/seed_5/case_2/demonstrations", "notebook 01")
@@ -116,31 +105,19 @@ def test_wrong_arguments_end_at_once_with_nothing_run_and_nothing_written(monkey
     assert everything_below(here) == []
 
 
+@pytest.mark.parametrize("name", ["output", "output_root"])
 @pytest.mark.parametrize(
-    "output", ["src/helpers/run.ipynb", "notebooks/01_demonstrations.ipynb", "results/../README.md", "x.ipynb"]
+    "place", ["src/x.ipynb", "notebooks/x.ipynb", "results/../x.ipynb", "reports/template", "reports/latest/../reference"]
 )
-def test_no_executed_copy_is_written_over_what_the_project_is_made_of(monkeypatch, here, capfd, output):
+def test_no_run_writes_over_what_the_project_is_made_of_nor_what_it_keeps(monkeypatch, here, capfd, name, place):
     monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, **__: pytest.fail("the notebook was run"))
     (here / "link").symlink_to(PROJECT)
-    for place in (PROJECT / output, here / "link" / output):
-        assert run.main(["01_demonstrations", str(place), "-p", "output_root", str(here / "out")]) == 2
-        assert "'output'" in capfd.readouterr().err
-    assert everything_below(here) == ["link"]
-
-
-@pytest.mark.parametrize("folder", ["template", "reference", "latest/../template/deep"])
-def test_no_run_writes_over_the_committed_part_of_the_reports(monkeypatch, here, capfd, folder):
-    monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, **__: pytest.fail("the notebook was run"))
-    (here / "link").symlink_to(PROJECT)
-    before = [everything_below(PROJECT / part) for part in run.COMMITTED]
     for project in (PROJECT, here / "link"):
-        place = str(project / "reports" / folder)
-        for name, arguments in (("output", [f"{place}/report.css"]), ("output_root", ["x.ipynb", "-p", "output_root", place])):
-            assert run.main(["05_report", *arguments]) == 2
-            said = capfd.readouterr().err
-            assert said.startswith(f"error: parameter '{name}': no run writes into reports/template/ and reports/reference/")
-            assert said.count("\n") == 1
-    assert [everything_below(PROJECT / part) for part in run.COMMITTED] == before
+        found = str(project / place)
+        assert run.main(["05_report", *([found] if name == "output" else ["x.ipynb", "-p", name, found])]) == 2
+        said = capfd.readouterr().err
+        assert said.startswith(f"error: parameter '{name}': inside the project results go below results/ and reports/ but not into")
+        assert said.count("\n") == 1
     assert everything_below(here) == ["link"]
 
 
@@ -173,16 +150,8 @@ def test_a_damaged_parameter_file_is_marked_for_the_summary_and_the_older_copy_s
 
 @pytest.mark.torture
 def test_a_missing_result_ends_in_a_sentence_and_keeps_the_executed_copy(here, capfd):
-    arguments = [
-        "02_offline_irl",
-        "copies/02.ipynb",
-        "-p",
-        "input_root",
-        str(here / "nothing"),
-        "-p",
-        "output_root",
-        str(here / "out"),
-    ]
+    roots = [("-p", f"{name}_root", str(here / folder)) for name, folder in (("input", "nothing"), ("output", "out"))]
+    arguments = ["02_offline_irl", "copies/02.ipynb", *roots[0], *roots[1]]
     assert run.main(arguments) == 1
     said = capfd.readouterr().err.strip()
     missing = here / "nothing/smoke/seed_0/case_1/demonstrations/record.json"

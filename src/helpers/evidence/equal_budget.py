@@ -23,7 +23,6 @@ from helpers.plant.controllers import PID, Controller
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
 from helpers.runs.finished import State
-from helpers.runs.session import Session
 from helpers.runs.study import Study, copied
 from helpers.settings.leaf import InputError
 from helpers.settings.limits import LimitsParams, LimitsScaleParams
@@ -39,21 +38,15 @@ class PackageError(InputError):
 
 
 @dataclass(frozen=True)
-class Contest:
+class Contest(Prepared):
     """What all learners of one case share: the results of the stages before, the settings, and how much is computed."""
 
-    prepared: Prepared
-    params: LimitsParams
-
-    @property
-    def session(self) -> Session:
-        """The session of the case."""
-        return self.prepared.session
+    limits: LimitsParams
 
     @property
     def scale(self) -> LimitsScaleParams:
         """How much this scale computes."""
-        return self.params.scales[self.session.scale]
+        return self.limits.scales[self.session.scale]
 
     @property
     def batch(self) -> int:
@@ -67,8 +60,8 @@ class Contest:
 
     def sharpness(self, episodes: int, dense: bool) -> float:
         """Beta of the reward after so many episodes; where `dense`, it begins with the smaller one."""
-        early = episodes < self.params.dense.share * self.scale.episodes
-        return self.params.dense.beta if dense and early else self.beta
+        early = episodes < self.limits.dense.share * self.scale.episodes
+        return self.limits.dense.beta if dense and early else self.beta
 
     def returns(self, trajectories: Trajectories) -> Tensor:
         """The real objective of each trajectory on the true state, shape (K,)."""
@@ -99,7 +92,7 @@ class Visitor:
         """A curve as it was kept."""
         return [(int(episodes), mean, error) for episodes, mean, error in rows]
 
-    def __call__(self, episodes: int, controller: Controller) -> None:
+    def __call__(self, episodes: int, controller: Controller | LSTMPolicy) -> None:
         """Add a point."""
         returns = self.contest.returns(self.contest.session.fresh(controller, self.contest.scale.judged))
         self.curve.append((episodes, returns.mean().item(), returns.std().item() / len(returns) ** 0.5))
@@ -112,11 +105,11 @@ def reinforced(contest: Contest, start: LSTMPolicy, purpose: str, dense: bool) -
     learner = session.online_learner(policy, contest.batch, n_epochs, session.stream("limits", purpose))
 
     def train() -> State:
-        visitor(0, session.deploy(learner.average))
+        visitor(0, learner.average)
         while learner.epochs < n_epochs:
             algorithm_1(learner, partial(learner.features.tracking, beta=contest.sharpness(learner.episodes, dense)), 1)
             if visitor.due(learner.episodes):
-                visitor(learner.episodes, session.deploy(learner.average))
+                visitor(learner.episodes, learner.average)
         return {"policy": learner.average.state_dict(), "curve": visitor.curve}
 
     kept = session.trained(train, learner, purpose)
@@ -132,7 +125,7 @@ def retuned(contest: Contest) -> Learned:
 
     The gains are searched in units of those of the demonstrator and stay positive. The curve is that of the search's mean.
     """
-    session, params, visitor = contest.session, contest.params.tuning, Visitor(contest)
+    session, params, visitor = contest.session, contest.limits.tuning, Visitor(contest)
     start, generator = session.params.demonstrator, session.stream("limits", "tuning")
     proportional, integral = np.array(start.proportional), np.array(start.integral)
     derivative = params.derivative_unit * proportional * session.params.process.sampling_time
@@ -177,7 +170,7 @@ def from_library(contest: Contest, name: str) -> Learned:
             f"({error.name}); run python -m pip install -e '.[alternatives]'"
         ) from error
     session, visitor = contest.session, Visitor(contest)
-    params, policy = getattr(contest.params, name), session.params.learning.policy
+    params, policy = getattr(contest.limits, name), session.params.learning.policy
     model = library.library_learner(
         name, session.process, session.task, policy, params, session.features.params.discount, contest.batch, session.seed
     )
@@ -200,7 +193,7 @@ def from_library(contest: Contest, name: str) -> Learned:
 
 def predictive(contest: Contest) -> Learned:
     """Offset-free MPC, which learns nothing: it has the model of the process instead."""
-    params = contest.params.predictive
+    params = contest.limits.predictive
 
     def build(run: Study) -> Controller:
         nominal = contest.session.process
@@ -213,10 +206,9 @@ def predictive(contest: Contest) -> Learned:
 
 def learn_all(contest: Contest) -> dict[str, Learned]:
     """Every alternative by name, in the order of the report."""
-    prepared = contest.prepared
-    clone = cloned(prepared, prepared.demonstrations.trajectories)
+    clone = cloned(contest, contest.demonstrations.trajectories)
     learned = {
-        "irl_reinforce": reinforced(contest, prepared.imitator, "hot", False),
+        "irl_reinforce": reinforced(contest, contest.imitator, "hot", False),
         "clone_reinforce": reinforced(contest, clone, "cloned", False),
         "scratch_reinforce": reinforced(contest, contest.session.fresh_policy(), "scratch", True),
         "pid_tuned": retuned(contest),
@@ -225,7 +217,7 @@ def learn_all(contest: Contest) -> dict[str, Learned]:
     if contest.scale.library:
         learned |= {name: from_library(contest, name) for name in ("ppo", "recurrent_ppo")}
     visitor = Visitor(contest)
-    visitor(0, contest.session.deploy(clone))
+    visitor(0, clone)
     return {"clone": Learned(partial(_deployed, clone), visitor.curve)} | learned
 
 

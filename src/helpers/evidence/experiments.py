@@ -133,10 +133,10 @@ def predictive(prepared: Prepared) -> SaturatedLQ:
 def responses(prepared: Prepared) -> Scores:
     """How expert, imitating policy, improved policy and predictive controller respond to the same disturbances."""
     session = prepared.session
-    controllers: dict[str, Controller] = {
+    controllers: dict[str, Controller | LSTMPolicy] = {
         "expert": session.expert,
-        "offline": session.deploy(prepared.imitator),
-        "online": session.deploy(prepared.improved),
+        "offline": prepared.imitator,
+        "online": prepared.improved,
         "predictive": predictive(prepared),
     }
     comparison = prepared.params.comparison

@@ -38,8 +38,8 @@ def exploring_episodes(contest: Contest) -> pd.DataFrame:
     """
     online = contest.session.params.case.online
     starts = {
-        "hot": (contest.prepared.imitator, online.beta),
-        "scratch": (contest.session.fresh_policy(), (contest.params.dense.beta, *online.beta[1:])),
+        "hot": (contest.imitator, online.beta),
+        "scratch": (contest.session.fresh_policy(), (contest.limits.dense.beta, *online.beta[1:])),
     }
     return pd.concat([_explore(contest, name, *start) for name, start in starts.items()], ignore_index=True)
 

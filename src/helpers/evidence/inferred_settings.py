@@ -24,7 +24,7 @@ TWO_SIDED = ("T_E",)  # inputs whose bounds are fitted side by side; PID1 never 
 
 
 @dataclass(frozen=True)
-class Study:
+class Fitting:
     """What every fit starts from: the session, and the sampling errors of the published rows at the settings of the files.
 
     The search takes half an hour, so every fit and profile that is finished is kept: an interrupted run goes on behind the last.
@@ -158,9 +158,9 @@ def _what(problem: Problem) -> tuple[Any, ...]:
     return tuple(problem.cases), problem.free, problem.fixed, problem.reading, problem.overshoot_unit
 
 
-def study(session: IdentificationSession) -> Study:
+def study(session: IdentificationSession) -> Fitting:
     """What every fit starts from."""
-    return Study(session, sampling_errors(session, MAIN))
+    return Fitting(session, sampling_errors(session, MAIN))
 
 
 def sampling_errors(session: IdentificationSession, reading: Reading) -> dict[int, Vector]:
@@ -173,7 +173,7 @@ def sampling_errors(session: IdentificationSession, reading: Reading) -> dict[in
     return errors
 
 
-def rows_table(study: Study) -> pd.DataFrame:
+def rows_table(study: Fitting) -> pd.DataFrame:
     """What is fitted: the published expert rows, each with its sampling error; a column for each feature."""
     rows: dict[tuple[str, str], Sequence[float] | Vector] = {}
     for case, row in study.session.published.items():
@@ -192,7 +192,7 @@ def fits_table(fits: Mapping[str, Sequence[Fit]]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def compare_readings(study: Study, joint: Fit, second: Fit) -> pd.DataFrame:
+def compare_readings(study: Fitting, joint: Fit, second: Fit) -> pd.DataFrame:
     """Every reading at its own best settings. Columns: reading; loss and mean relative error by table; then the settings shared.
 
     The first demonstrator is fitted with sampling time and bounds, the second at those. A reading may change the sampling errors
@@ -221,13 +221,13 @@ def compare_readings(study: Study, joint: Fit, second: Fit) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def dispersion(study: Study, joint: Fit, second: Fit) -> float:
+def dispersion(study: Fitting, joint: Fit, second: Fit) -> float:
     """The least loss a row: about one, or less, if only the sampling error of the rows kept the loss from zero."""
     rows = sum(len(study.sampling_error[case]) for case in study.session.params)
     return max(1.0, (joint.loss + second.loss) / rows)
 
 
-def profiles(study: Study, joint: Fit, gains: Mapping[str, Fit], rise: float) -> dict[str, Profile]:
+def profiles(study: Fitting, joint: Fit, gains: Mapping[str, Fit], rise: float) -> dict[str, Profile]:
     """The profiles of all settings, by name.
 
     Sampling time and bounds: all else is fitted again to the first demonstrator's tables. A gain: the same demonstrator's other
@@ -254,10 +254,10 @@ def profiles_table(found: Mapping[str, Profile]) -> pd.DataFrame:
     )
 
 
-def predictions(study: Study, gains: Mapping[str, Fit]) -> pd.DataFrame:
+def predictions(study: Fitting, gains: Mapping[str, Fit]) -> pd.DataFrame:
     """Every table on fresh trajectories: from the fits to all tables, from the files, and from the fit to one table alone.
 
-    Columns: fitted_on, then those of `Study.compared`. Sampling time and bounds are those of the files throughout.
+    Columns: fitted_on, then those of `Fitting.compared`. Sampling time and bounds are those of the files throughout.
     """
     session, scale = study.session, study.session.scale_params
     sources: list[tuple[str, Sequence[int], Values]] = []
@@ -278,7 +278,7 @@ def predictions(study: Study, gains: Mapping[str, Fit]) -> pd.DataFrame:
     return pd.concat(frames, ignore_index=True)[["fitted_on", *frames[0].columns[:-1]]]
 
 
-def settings_table(study: Study, joint: Fit, gains: Mapping[str, Fit], found: Mapping[str, Profile], rise: float) -> pd.DataFrame:
+def settings_table(study: Fitting, joint: Fit, gains: Mapping[str, Fit], found: Mapping[str, Profile], rise: float) -> pd.DataFrame:
     """What was found. Columns: setting, component, value, low, high, identified, in_parameter_files.
 
     From low to high the loss lies no more than `rise` above its least. Identified: neither end lies further from the value than a

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from helpers.evidence.attainable import Optimum, Resolution, Tabulated, dynamic_programme, grid_around
 from helpers.evidence.equal_budget import Build, Contest, Learned
-from helpers.evidence.experiments import Prepared, prepare
+from helpers.evidence.experiments import prepare
 from helpers.evidence.kalman import Filtered
 from helpers.learning.control_quality import harris_index, quality
 from helpers.learning.evaluation import objective
@@ -25,8 +25,7 @@ ON_STATE = ("minimum_variance_x", "dynamic_programme")  # full information: they
 
 def enter(session: Session) -> Contest:
     """What notebook 06 starts from: the results of notebooks 01 to 04 and params/limits.yaml."""
-    prepared: Prepared = prepare(session)
-    return Contest(prepared, load_limits(session.params_root, session.params))
+    return Contest(**vars(prepare(session)), limits=load_limits(session.params_root, session.params))
 
 
 def without_noise(session: Study) -> Study:
@@ -45,7 +44,7 @@ def attain(contest: Contest, beta: float) -> tuple[Optimum, pd.DataFrame]:
     agree within the tolerance, neither lies below one-step minimum variance on x, and the grid before gave the same within the
     tolerance. agrees: whether that was reached.
     """
-    params, scale, session = contest.params.attainable, contest.scale, without_noise(contest.session)
+    params, scale, session = contest.limits.attainable, contest.scale, without_noise(contest.session)
     features = session.features.on("x")
     reference = session.fresh(session.minimum_variance, scale.draws)
     least = objective(reference, features, beta).double().mean().item()
@@ -70,7 +69,7 @@ def attain(contest: Contest, beta: float) -> tuple[Optimum, pd.DataFrame]:
 
 def attainable(contest: Contest) -> tuple[dict[float, Optimum], pd.DataFrame]:
     """`attain` for every beta."""
-    found = {beta: attain(contest, beta) for beta in contest.params.attainable.betas}
+    found = {beta: attain(contest, beta) for beta in contest.limits.attainable.betas}
     return {beta: optimum for beta, (optimum, _) in found.items()}, pd.concat([rows for _, rows in found.values()])
 
 
@@ -97,11 +96,10 @@ def known_process(contest: Contest, optimum: Optimum | None = None, stationary: 
 
 def of_the_paper(contest: Contest) -> dict[str, Build]:
     """The demonstrating PID and the policies of notebooks 02 to 04, after offline and after online learning."""
-    prepared = contest.prepared
     return {
         "expert": lambda run: run.expert,
-        "offline": lambda run: run.deploy(prepared.imitator),
-        "online": lambda run: run.deploy(prepared.improved),
+        "offline": lambda run: run.deploy(contest.imitator),
+        "online": lambda run: run.deploy(contest.improved),
     }
 
 
@@ -148,7 +146,7 @@ def control_quality(contest: Contest, builds: Mapping[str, Build], stationary: M
 
     Columns: controller, figure, value. `stationary` holds the controllers of the long run where they differ.
     """
-    session, params, scale = contest.session, contest.params.quality, contest.scale
+    session, params, scale = contest.session, contest.limits.quality, contest.scale
     process, case = session.params.process, session.params.case
     at_rest = {"initial_mean": case.set_point, "initial_std": tuple(0.0 for _ in case.initial_std)}
     rows = []

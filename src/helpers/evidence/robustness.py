@@ -8,6 +8,7 @@ import pandas as pd
 from helpers.evidence.equal_budget import Build, Contest
 from helpers.evidence.mismatch import Delayed, LoadStep
 from helpers.learning.evaluation import objective
+from helpers.learning.policy import LSTMPolicy
 from helpers.plant.controllers import Controller
 from helpers.plant.process import Process
 from helpers.plant.rollout import rollout
@@ -34,7 +35,7 @@ class Condition(NamedTuple):
 
 def conditions(contest: Contest) -> list[Condition]:
     """Every plant and set point of params/limits.yaml; at a scale of `corners`, the first and last factor of each list alone."""
-    session, params = contest.session, contest.params.robustness
+    session, params = contest.session, contest.limits.robustness
     process, case = session.params.process, session.params.case
     grids = params.model_dump()
     if contest.scale.corners:
@@ -102,15 +103,14 @@ def improved_on_mismatch(contest: Contest) -> pd.DataFrame:
 
     Columns: state, input (factors), controller, objective. nominal: the policy that was improved on the plant of the model.
     """
-    params, prepared, rows = contest.params.robustness, contest.prepared, []
+    params, rows = contest.limits.robustness, []
     for state, entry in zip(params.improve_state, params.improve_input, strict=True):
         plant = mismatched(contest.session, state, entry)
-        improved = plant.improve(copied(prepared.imitator), "x").policy
-        controllers: dict[str, Controller] = {
+        controllers: dict[str, Controller | LSTMPolicy] = {
             "expert": plant.expert,
-            "offline": plant.deploy(prepared.imitator),
-            "online": plant.deploy(prepared.improved),
-            "online_there": plant.deploy(improved),
+            "offline": contest.imitator,
+            "online": contest.improved,
+            "online_there": plant.improve(copied(contest.imitator), "x").policy,
             "minimum_variance": contest.session.minimum_variance,
         }
         for name, controller in controllers.items():

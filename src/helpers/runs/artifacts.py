@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch
 from matplotlib.figure import Figure
@@ -174,22 +175,18 @@ def trajectories_to_table(
     `command_<name>` of each manipulated variable. The last sample of a trajectory has no input.
     """
     n_samples, n_trajectories = trajectories.x.shape[:2]
-    columns: dict[str, Any] = {
-        "trajectory": torch.arange(n_trajectories).repeat_interleave(n_samples).numpy(),
-        "sample": torch.arange(n_samples).repeat(n_trajectories).numpy(),
-    }
-    columns["time"] = columns["sample"] * sampling_time
-    for prefix, names, values in (
-        ("x", controlled, trajectories.x),
-        ("y", controlled, trajectories.y),
-        ("u", manipulated, trajectories.u),
-        ("command", manipulated, trajectories.command),
-    ):
-        padded = torch.full((n_samples, n_trajectories, values.shape[-1]), torch.nan, dtype=torch.float64)
-        padded[: len(values)] = values
-        for index, name in enumerate(names):
-            columns[f"{prefix}_{name}"] = padded[..., index].T.flatten().numpy()
+    sample = np.tile(np.arange(n_samples), n_trajectories)
+    columns = {"trajectory": np.repeat(np.arange(n_trajectories), n_samples), "sample": sample, "time": sample * sampling_time}
+    for prefix, names in _signals(controlled, manipulated).items():
+        values = getattr(trajectories, prefix).double()
+        padded = torch.cat([values, torch.full((n_samples - len(values), *values.shape[1:]), torch.nan, dtype=torch.float64)])
+        columns |= {f"{prefix}_{name}": padded[..., index].T.flatten().numpy() for index, name in enumerate(names)}
     return pd.DataFrame(columns)
+
+
+def _signals(controlled: tuple[str, ...], manipulated: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+    """The signals of a trajectory and the names of their variables."""
+    return {"x": controlled, "y": controlled, "u": manipulated, "command": manipulated}
 
 
 def trajectories_from_table(
@@ -200,7 +197,7 @@ def trajectories_from_table(
     Raises:
         ArtifactError: if a column is missing, the trajectories differ in length, or a number is not finite.
     """
-    groups = {"x": controlled, "y": controlled, "u": manipulated, "command": manipulated}
+    groups = _signals(controlled, manipulated)
     columns = ["trajectory", "sample", *(f"{prefix}_{name}" for prefix, names in groups.items() for name in names)]
     for column in columns:
         if column not in table:

@@ -22,7 +22,7 @@ from torch import Tensor
 from helpers.runs.scratch import beside, sweep
 
 State = dict[str, Any]
-TENSOR = "tensor:"  # marks, in the JSON, the place of a tensor
+TENSOR = "tensor"  # marks, in the JSON, the place of a tensor: {"tensor": its name}
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,9 @@ def _read(path: Path, training: str) -> State | None:
             if header.get("training") != training:
                 return None
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dictionary)
-            state: State = _assemble(json.loads(header["state"]), tensors)
+            state: State = json.loads(
+                header["state"], object_hook=lambda entry: tensors[entry[TENSOR]] if TENSOR in entry else entry
+            )
             return state
     except (OSError, SafetensorError, KeyError, ValueError):  # missing or damaged: the training is repeated
         return None
@@ -76,8 +78,13 @@ def _read(path: Path, training: str) -> State | None:
 def _write(path: Path, training: str, state: State) -> None:
     """Keep a state. On a full disk the run goes on: it only saves time."""
     tensors: dict[str, Tensor] = {}
-    plain = json.dumps(_take_apart(state, tensors))
-    partial = beside(path)
+
+    def taken_out(value: Tensor) -> dict[str, str]:
+        name = str(len(tensors))
+        tensors[name] = value.detach().clone().contiguous()
+        return {TENSOR: name}
+
+    plain, partial = json.dumps(state, default=taken_out), beside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path)
@@ -87,27 +94,3 @@ def _write(path: Path, training: str, state: State) -> None:
         warnings.warn(f"{path}: a finished training could not be kept: {error.strerror}", stacklevel=2)
         with suppress(OSError):
             partial.unlink()
-
-
-def _take_apart(value: Any, tensors: dict[str, Tensor]) -> Any:
-    """The same structure with the name of a tensor in place of each, and the tensors by these names."""
-    if isinstance(value, Tensor):
-        name = str(len(tensors))
-        tensors[name] = value.detach().clone().contiguous()
-        return TENSOR + name
-    if isinstance(value, dict):
-        return {str(key): _take_apart(entry, tensors) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_take_apart(entry, tensors) for entry in value]
-    return value
-
-
-def _assemble(value: Any, tensors: dict[str, Tensor]) -> Any:
-    """The inverse of `_take_apart`; tuples come back as lists."""
-    if isinstance(value, str) and value.startswith(TENSOR):
-        return tensors[value.removeprefix(TENSOR)]
-    if isinstance(value, dict):
-        return {key: _assemble(entry, tensors) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_assemble(entry, tensors) for entry in value]
-    return value

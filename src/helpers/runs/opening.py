@@ -1,7 +1,7 @@
 """What every run of a notebook begins with: its parameters, checked, and where its results come from and go."""
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -170,13 +170,8 @@ class ReportSession:
 
 
 def parameters_hash(params: Params) -> str:
-    """A hash of every parameter that a case was run with."""
-    return leaves_hash(params.leaves)
-
-
-def leaves_hash(leaves: Iterable[Mapping[str, Any]]) -> str:
-    """A hash of the values of leaves."""
-    return digest([[leaf["file"], leaf["key"], leaf["value"]] for leaf in leaves])
+    """A hash of the value of every parameter that a case was run with."""
+    return digest([[leaf["file"], leaf["key"], leaf["value"]] for leaf in params.leaves])
 
 
 def checked(notebook: str, namespace: dict[str, Any]) -> tuple[dict[str, Any], Params]:

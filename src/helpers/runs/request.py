@@ -21,7 +21,7 @@ NOTEBOOK_PARAMETERS = {
     "output_root": str,
     "params_root": str,
 }
-WRITABLE = ("results", "reports")
+WRITABLE, COMMITTED = ("results", "reports"), ("reports/template", "reports/reference")
 
 
 class SessionError(InputError):
@@ -72,9 +72,11 @@ def check_parameters(notebook: str, given: Mapping[str, Any]) -> Params:
 def check_place(name: str, place: Path) -> None:
     """Refuse a place inside the project that is not among results and reports: no run may write over what it is made of.
 
-    Links and dots are resolved first.
+    Nor does it write into the committed part of the reports, where people do, and make publish, bench and torture. Links and dots
+    are resolved first.
     """
     found = place.resolve()
-    if found.is_relative_to(PROJECT) and not any(found.is_relative_to(PROJECT / folder) for folder in WRITABLE):
-        where = " and ".join(f"{folder}/" for folder in WRITABLE)
-        raise SessionError(f"parameter '{name}': inside the project results go below {where}, not to {found}")
+    inside = [folder for folder in (".", *WRITABLE, *COMMITTED) if found.is_relative_to(PROJECT / folder)]
+    if inside and inside[-1] not in WRITABLE:
+        where, never = (" and ".join(f"{folder}/" for folder in folders) for folders in (WRITABLE, COMMITTED))
+        raise SessionError(f"parameter '{name}': inside the project results go below {where} but not into {never}, not to {found}")

@@ -4,7 +4,6 @@ import ast
 import hashlib
 import itertools
 import json
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -69,17 +68,11 @@ def _code(notebook: str, project: Path) -> str:
 @cache
 def _imported(code: str) -> tuple[str, ...]:
     """What a piece of code names of this package in its import statements: rooms, modules, and names that may be none."""
-    return tuple(_import_names(code))
-
-
-def _import_names(code: str) -> Iterator[str]:
+    names: list[str] = []
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
-            names = [f"{node.module}.{alias.name}" for alias in node.names]
-        else:
-            continue
-        for name in names:
-            if name.split(".")[0] == PACKAGE:
-                yield from itertools.accumulate(name.split("."), "{}.{}".format)  # the rooms on the way are imported too
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
+    own = [name.split(".") for name in names if name.split(".")[0] == PACKAGE]
+    return tuple(path for parts in own for path in itertools.accumulate(parts, "{}.{}".format))  # the rooms on the way too

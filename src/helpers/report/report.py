@@ -220,7 +220,7 @@ def shortened(drawing: str) -> str:
 def _with_palette(png: bytes) -> bytes:
     """The PNG of see-through lines with a palette; one without transparency is a map whose every colour is a value, and stays."""
     picture, found = Image.open(io.BytesIO(png)).convert("RGBA"), io.BytesIO()
-    if picture.getextrema()[3] == (255, 255):
+    if picture.getchannel("A").getextrema() == (255, 255):
         return png
     picture.quantize(PALETTE).save(found, format="PNG", optimize=True)
     return min(png, found.getvalue(), key=len)

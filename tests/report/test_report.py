@@ -175,6 +175,12 @@ def test_every_figure_and_table_of_the_paper_has_its_files(written):
         assert table[FEATURES].notna().all(axis=None)
 
 
+def test_a_drawing_is_shortened_by_what_no_screen_shows():
+    text = '<text style="font-size: 9px; font-family: A, B; fill: #333" x="1.23456" transform="rotate(-0 1.2 3.4)">0.12345</text>'
+    short = '<text style="font-size: 9px; fill: #333" x="1.23">0.12345</text>'
+    assert report.shortened(f'<svg width="9.123">\n  {text}</svg>') == f'<svg font-family="A, B" width="9.123">\n{short}</svg>'
+
+
 def test_what_an_older_report_left_is_replaced_and_other_files_stay(written):
     assert (written / "notes.txt").read_text() == (written / "notebooks/05_report.ipynb").read_text() == "old"
     assert not (written / "figures/figure_9.png").exists()

@@ -207,7 +207,7 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
 def shortened(drawing: str) -> str:
     """An SVG drawing in half the bytes, without what no screen shows.
 
-    Coordinates have two decimals, the font is named once, nothing is indented or turned by nought, and the pictures inside have a
+    Coordinates have two decimals, the font is named once, nothing is indented or turned by nought, and pictures of lines have a
     palette.
     """
     drawing = re.sub(r' (?:[dxy]="|transform="[rt])[^"]*"', lambda found: re.sub(r"(\.\d\d)\d+", r"\1", found[0]), drawing)
@@ -218,9 +218,11 @@ def shortened(drawing: str) -> str:
 
 
 def _with_palette(png: bytes) -> bytes:
-    """The PNG with a palette of its own, its transparency kept."""
-    found = io.BytesIO()
-    Image.open(io.BytesIO(png)).convert("RGBA").quantize(PALETTE).save(found, format="PNG", optimize=True)
+    """The PNG of see-through lines with a palette; one without transparency is a map whose every colour is a value, and stays."""
+    picture, found = Image.open(io.BytesIO(png)).convert("RGBA"), io.BytesIO()
+    if picture.getchannel("A").getextrema() == (255, 255):
+        return png
+    picture.quantize(PALETTE).save(found, format="PNG", optimize=True)
     return min(png, found.getvalue(), key=len)
 
 

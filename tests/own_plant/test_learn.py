@@ -62,7 +62,7 @@ def quick_root(root, tmp_path):
     return folder
 
 
-@pytest.mark.parametrize(("n_y", "n_u"), [(1, 1), (3, 2), (2, 3)])
+@pytest.mark.parametrize(("n_y", "n_u"), [(1, 1), (3, 2), pytest.param(2, 3, marks=pytest.mark.torture)])
 def test_the_whole_chain_runs_for_any_number_of_variables(n_y, n_u, tmp_path, root):
     path = MadeUpPlant(n_y, n_u).write(tmp_path)
     plant = small(learn.open_plant(path, root, "smoke", 0))

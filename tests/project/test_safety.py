@@ -31,7 +31,7 @@ def test_a_module_has_no_way_to_a_network_and_no_loader_that_runs_code(path):
         if isinstance(node, ast.Call):
             name = getattr(node.func, "attr", getattr(node.func, "id", ""))
             owner = getattr(getattr(node.func, "value", None), "id", "")
-            assert name not in CALLS or owner in ("re", "expression"), ast.unparse(node)
+            assert name not in CALLS or owner in ("re", "expression", "to_c"), ast.unparse(node)
             assert not (owner in ("torch", "np", "numpy") and name == "load"), ast.unparse(node)
             assert "shell" not in {keyword.arg for keyword in node.keywords}, ast.unparse(node)
             if name == "YAML":

@@ -127,7 +127,8 @@ def export(
 
 def export_c(static: Path, path: Path) -> Path:
     """The static file as one C source without dependencies: `policy(y, set_point, u_previous, memory.., u, memory_next..)`."""
-    path.write_text(Compiler(CompilerOptions(model_name="policy")).compile(onnx.load(static)), encoding="utf-8")
+    to_c = Compiler(CompilerOptions(model_name="policy"))
+    path.write_text(to_c.compile(onnx.load(static)), encoding="utf-8")
     return path
 
 

@@ -17,6 +17,7 @@ from helpers.own_plant.learn import Workshop, learn_policy, open_workshop
 from helpers.plant.process import Process
 from helpers.plant.tracking import Scenarios, Tracker, track
 
+CAREFUL = 0.9  # share of the allowed movement that the policy is given to learn with
 FIGURES = ("mean |e|", "movement", "offset")
 
 
@@ -101,7 +102,9 @@ def improve_on_plant(workshop: Workshop, identified: Identified, policy: Trackin
     # What was unknown of the plant has been seen by now; half of the declared margins stays.
     margins = plant.params.margins
     narrow = margins.model_copy(update={"gain": margins.gain / 2, "time": margins.time / 2, "dead_time": 0})
-    informed = replace(plant, params=plant.params.model_copy(update={"margins": narrow}))
+    # Models of the plant under this policy flatter its movement a little.
+    careful = plant.params.policy.model_copy(update={"movement": CAREFUL * plant.params.policy.movement})
+    informed = replace(plant, params=plant.params.model_copy(update={"margins": narrow, "policy": careful}))
     new, _ = learn_policy(replace(open_workshop(informed, again), record=workshop.record, operation=operation), policy, "online")
     fresh = plant_episodes(workshop, process, params.test, generator)
     with torch.no_grad():

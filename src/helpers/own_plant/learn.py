@@ -148,7 +148,7 @@ def learn_offline(plant: OwnPlant, process: Process, task: ControlTask) -> tuple
 
 @dataclass(frozen=True)
 class Workshop:
-    """Everything that controllers are tuned, trained and judged on; float32, as they run.
+    """Everything that controllers are tuned, trained and judged on.
 
     Attributes:
         operation: the range of set points, the loops and the bounds. record: the PID of the record, and `explained` of its moves.
@@ -189,7 +189,7 @@ def open_workshop(plant: OwnPlant, identified: Identified) -> Workshop:
     Raises:
         InputError: if the record's controller is no PID and the description names none.
     """
-    dtype, params, clean, description = torch.float32, plant.params, plant.clean, plant.description
+    dtype, params, clean, description = plant.dtype, plant.params, plant.clean, plant.description
     found, explained = recorded_gains(clean, description, dtype)
     record = described_gains(description, dtype) or found
     loops = tuple(torch.nonzero(record.integral.abs().sum(0) > 0).flatten().tolist())

@@ -123,9 +123,9 @@ def progress_figure(records: Sequence[GradientRecord]) -> Figure:
     frame = pd.DataFrame([vars(record) for record in records]).rename(columns=CURVES)
     figure = empty_figure(WIDTH, 3.0)
     for axis, (name, level) in zip(figure.subplots(1, 3), zip(CURVES.values(), (1.0, 1.0, None), strict=True), strict=True):
-        axis.plot(frame.index + 1, frame[name], color=SIMULATED, linewidth=1.0)
+        axis.plot(frame.index + 1, frame[name], color=SIMULATED, linewidth=1.0, label=name)
         if level is not None:
-            axis.axhline(level, color=INK, linewidth=1.0, linestyle="--")
+            axis.axhline(level, color=INK, linewidth=1.0, linestyle="--", label="the PID")
         axis.set_title(name, loc="left")
         axis.set_xlabel("gradient step")
     return figure

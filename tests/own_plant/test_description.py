@@ -67,7 +67,6 @@ def test_the_committed_description_gives_the_task_of_case_study_one_with_its_own
         (changed("transfer", value={"u0": 51.0}), ["'transfer' names 'u0', which is no controlled variable"]),
         (changed("transfer", value={"y0": 1.0e9}), ["'transfer' takes 'y0' outside 'low' to 'high'"]),
         (changed("transfer", value={"y0": "far"}), ["'transfer.y0'"]),
-        (changed("transfer", value={"y0": 50.0}), ["'transfer' takes 'y0' to its 'steady_state'", "give 'error_scale'"]),
     ],
 )
 def test_what_cannot_be_is_refused(content, says, tmp_path):
@@ -78,15 +77,6 @@ def test_what_cannot_be_is_refused(content, says, tmp_path):
     assert sentence.startswith(str(path))
     assert "\n" not in sentence
     assert all(words in sentence for words in says), sentence
-
-
-def test_a_task_back_at_the_steady_state_needs_a_scale_of_the_error(tmp_path):
-    description = load_description(PLANT.write(tmp_path))
-    with pytest.raises(ParameterError, match=r"set point of 'y1': it equals 'steady_state', .* give 'error_scale'"):
-        description.with_set_points({"y1": 51.0})
-    scaled = changed("controlled", 1, "error_scale", value=0.5) | {"transfer": {"y1": 51.0}}
-    description = load_description(PLANT.write(tmp_path, **scaled))
-    assert description.with_set_points(description.transfer).controlled[1].scale == 0.5
 
 
 def test_columns_that_hold_no_numbers_may_be_called_as_they_like(tmp_path):

@@ -56,9 +56,11 @@ class Descent:
 
 def differentiable(process: Process) -> bool:
     """Whether torch can differentiate the step of a process in its input."""
-    u = torch.zeros(1, process.n_inputs, requires_grad=True)
-    x = torch.zeros(1, process.n_states)
-    return bool(process.step(x, u, torch.zeros_like(x)).requires_grad)
+    u, x = torch.zeros(1, process.n_inputs, requires_grad=True), torch.zeros(1, process.n_states)
+    try:
+        return process.step(x, u, torch.zeros_like(x)).requires_grad
+    except RuntimeError:  # numpy takes no tensor that carries a gradient
+        return False
 
 
 def model_gradient(

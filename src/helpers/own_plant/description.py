@@ -13,7 +13,7 @@ from pydantic_core import PydanticCustomError
 from torch import Tensor
 
 from helpers.plant.task import ControlTask
-from helpers.settings.leaf import Count, NotZero, ParameterError, Positive, Real, Record, Text, read_yaml, validate
+from helpers.settings.leaf import Count, NotZero, Positive, Real, Record, Text, read_yaml, validate
 
 SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 RESERVED = ("row", "clock", "run", "automatic", "segment")  # columns that the table of a record has beside those of the tags
@@ -105,7 +105,7 @@ class PlantDescription(Record):
         sampling_time: in `time_unit`. horizon: T, samples of an episode. episode: a column that changes with every run.
         mode: a column; only rows where it holds one of `automatic` show the controller at work.
         plant: what stands for the plant online, `package.module:Class` or `gymnasium:Id`; without it the identified model does.
-        transfer: other set points by name of the controlled variable, which the file has steps to as well; none: no transfer.
+        transfer: further set points by name of the controlled variable, which widen the range of those in the file.
     """
 
     title: Text
@@ -147,9 +147,6 @@ class PlantDescription(Record):
                 raise PydanticCustomError("transfer", "'transfer' names '{name}', which is no controlled variable", {"name": name})
             if not aimed.low <= value <= aimed.high:
                 raise PydanticCustomError("transfer", "'transfer' takes '{name}' outside 'low' to 'high'", {"name": name})
-            if aimed.error_scale is None and value == aimed.steady_state:
-                still = "'transfer' takes '{name}' to its 'steady_state', so the error has no scale: give 'error_scale'"
-                raise PydanticCustomError("transfer", still, {"name": name})
         return self
 
     @property
@@ -183,25 +180,6 @@ class PlantDescription(Record):
             input_high=tensor([variable.high - variable.steady_state for variable in self.manipulated]),
             n_steps=self.horizon,
         )
-
-    def with_set_points(self, set_points: dict[str, float]) -> "PlantDescription":
-        """The same plant with other set points, by name of the controlled variable: the task of a transfer.
-
-        Raises:
-            ParameterError: if a name is unknown, or a set point is the steady state of a variable without 'error_scale'.
-        """
-        unknown = sorted({*set_points} - {variable.name for variable in self.controlled})
-        if unknown:
-            known = ", ".join(variable.name for variable in self.controlled)
-            raise ParameterError(f"set point of '{unknown[0]}': expected one of {known}")
-        moved = [
-            variable.model_copy(update={"set_point": set_points.get(variable.name, variable.set_point)})
-            for variable in self.controlled
-        ]
-        still = next((variable.name for variable in moved if variable.scale == 0), None)
-        if still is not None:
-            raise ParameterError(f"set point of '{still}': it equals 'steady_state', so the error has no scale: give 'error_scale'")
-        return self.model_copy(update={"controlled": tuple(moved)})
 
 
 def load_description(path: Path) -> PlantDescription:

@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 BLOCK = 50  # samples that are drawn together into a member of the ensemble
 STEPS, RESTARTS = 12, 2  # Gauss-Newton steps of a fit and of one member of the ensemble
 LONG = 12  # lags of the autoregression whose residuals stand for the innovations at the start
+ENDS = 1.3  # drawn from -1.3 to 1.3 and cut to -1 to 1, almost a quarter of all draws lie at the ends
 TOLD = 4.0  # standard errors from zero
 FARTHEST = 0.98  # modulus of a zero of C: beyond it the filter 1/C would remember for longer than a record
 
@@ -333,9 +334,10 @@ class Margins:
 
     @classmethod
     def draw(cls, params: MarginParams, n_inputs: int, rng: np.random.Generator) -> "Margins":
-        """Evenly within the declared margins."""
+        """Within the declared margins and often at their ends, so that the corners count too."""
         more = tuple(int(number) for number in rng.integers(0, params.dead_time + 1, n_inputs))
-        return cls(1 + params.gain * rng.uniform(-1, 1, n_inputs), 1 + params.time * rng.uniform(-1, 1), more)
+        gain, time = (np.clip(rng.uniform(-ENDS, ENDS, n), -1, 1) for n in (n_inputs, 1))
+        return cls(1 + params.gain * gain, 1 + params.time * float(time[0]), more)
 
 
 def slowed(coefficients: Array, time: float) -> Array:

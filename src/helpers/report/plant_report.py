@@ -44,6 +44,7 @@ from helpers.settings.leaf import InputError
 from helpers.settings.paper import load
 
 AGREEMENT = 1e-5  # of the input range, between the exported policy and torch
+MEANINGLESS = 10.0  # a relative feature gap beyond which a feature of the record is next to zero
 NAMES = ("policy.onnx", f"policy{STATIC}.onnx", "policy.c", "report.md")  # what the command writes beside its figures
 
 
@@ -106,6 +107,11 @@ def offline(plant: OwnPlant, workshop: Workshop) -> tuple[dict[str, pd.DataFrame
         return {}, f"the weights of the record's controller were not found: {error}"
     weights = pd.DataFrame({"alpha*": found.weights.tolist()}, index=study.feature_names)
     gap = min(record.feature_gap for record in found.records)
+    if gap > MEANINGLESS:
+        return (
+            {},
+            "Algorithm 2 has nothing to match: a feature of the record is next to zero, for its variable stays far from its set point",
+        )
     return {"Reward weights": weights}, f"Algorithm 2 matches the features of the record to {100 * gap:.1f} %"
 
 

@@ -110,7 +110,7 @@ def offline(plant: OwnPlant, workshop: Workshop) -> tuple[dict[str, pd.DataFrame
     if gap > MEANINGLESS:
         return (
             {},
-            "Algorithm 2 has nothing to match: a feature of the record is next to zero, for its variable stays far from its set point",
+            "Algorithm 2 has nothing to match: a feature of the record is next to zero, its variable is far from its set point",
         )
     return {"Reward weights": weights}, f"Algorithm 2 matches the features of the record to {100 * gap:.1f} %"
 

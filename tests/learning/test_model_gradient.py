@@ -67,7 +67,7 @@ def test_the_gradient_is_that_of_finite_differences(case):
 
 @pytest.mark.equation("3.2.4")
 def test_reinforce_expects_the_same_gradient(case):
-    """One step with the input drawn about the policy's, u ~ N(mu, sigma^2): E[cost grad ln pi] against the gradient through the model.
+    """One step with the input drawn about the policy's, u ~ N(mu, sigma^2): E[cost grad ln pi] against that through the model.
 
     The draw of the input is the load, which the process adds to the policy's mean.
     """

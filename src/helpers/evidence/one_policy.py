@@ -9,12 +9,11 @@ import torch
 from torch import Tensor
 
 from helpers.evidence.robustness import mismatched
-from helpers.learning.evaluation import objective, total_variation
+from helpers.learning.evaluation import objective
 from helpers.learning.features import discounts
 from helpers.learning.model_gradient import Descent, GradientRecord, model_gradient
 from helpers.learning.tracking_policy import Gains, PatientPolicy, TrackingPolicy, VelocityPID
 from helpers.plant.controllers import Controller
-from helpers.plant.process import LinearProcess
 from helpers.plant.task import Trajectories
 from helpers.plant.tracking import AtSetPoint, Bounds, Scenarios, Tracked, Tracker, track
 from helpers.runs.finished import State
@@ -72,8 +71,9 @@ class Ground:
         for case, study in self.cases.items():
             for first in self.set_point_factors:
                 for others in self.set_point_factors:
-                    target = [first * study.params.case.set_point[0], *(others * entry for entry in study.params.case.set_point[1:])]
-                    found.append((case, (first, others), study.varied(case={"set_point": tuple(target)})))
+                    one, *more = study.params.case.set_point
+                    target = (first * one, *(others * entry for entry in more))
+                    found.append((case, (first, others), study.varied(case={"set_point": target})))
         return found
 
     def error_scale(self, set_point: Tensor) -> Tensor:
@@ -82,7 +82,7 @@ class Ground:
         return torch.where(set_point < 0, -1.0, 1.0) * set_point.abs().maximum(least)
 
     def policy(self, gains: Gains, kept: float | None = None) -> TrackingPolicy:
-        """A policy that is the PID with these gains; `kept`: of `PatientPolicy`, as in the parameter file unless given, none if zero."""
+        """A policy that begins as the PID with these gains; `kept`: of `PatientPolicy`, as in the parameter file unless given."""
         # torch.nn draws the first weights from the global stream.
         torch.manual_seed(int(torch.randint(2**31, (1,), generator=self.session.stream("one_policy", "weights"))))
         low, high = self.set_points.amin(0), self.set_points.amax(0)
@@ -99,29 +99,35 @@ class Ground:
                 ranges; it comes at any sample, and in half of the episodes.
         """
         session = self.session
-        process, task, like = session.process, session.task, {"generator": generator, "dtype": session.dtype}
+        process, task = session.process, session.task
+        normal = partial(torch.randn, generator=generator, dtype=session.dtype)
+        even = partial(torch.rand, generator=generator, dtype=session.dtype)
         n_steps, n_x, n_u = task.n_steps, process.n_states, process.n_inputs
         low, high = self.set_points.amin(0), self.set_points.amax(0)
-        set_point = low + (high - low) * torch.rand(n_episodes, len(low), **like)
-        state, entry = 1 + margin * (2 * torch.rand(2, n_episodes, **like) - 1)
+        set_point = low + (high - low) * even((n_episodes, len(low)))
+        state, entry = 1 + margin * (2 * even((2, n_episodes)) - 1)
         begins = torch.randint(2 * n_steps, (n_episodes,), generator=generator)
-        step = load * self.bounds.span * torch.randn(n_episodes, n_u, **like)
+        step = load * self.bounds.span * normal((n_episodes, n_u))
         return Scenarios(
             process.scaled(state, entry) if margin else process,
             set_point.expand(n_steps, -1, -1),
             step * (torch.arange(n_steps)[:, None] >= begins)[..., None],
-            task.initial_mean + task.initial_std * torch.randn(n_episodes, n_x, **like),
+            task.initial_mean + task.initial_std * normal((n_episodes, n_x)),
             torch.zeros(n_episodes, n_u, dtype=session.dtype),
-            torch.randn(n_steps, n_episodes, n_x, **like),
-            torch.randn(n_steps + 1, n_episodes, process.n_outputs, **like),
+            normal((n_steps, n_episodes, n_x)),
+            normal((n_steps + 1, n_episodes, process.n_outputs)),
         )
+
+    def moved(self, u: Tensor) -> Tensor:
+        """How far the inputs (T, K, n_u) move in an episode, in ranges of theirs, (K,)."""
+        return (u.diff(dim=0).abs() / self.bounds.span).sum((0, 2))
 
     def lost(self, scenarios: Scenarios, run: Tracked, beta: float) -> Tensor:
         """1 - J / J_max of each episode, (K,), with the tracking objective J of Eq. 5.1.2.1 on the true state.
 
         Of each reward the expectation over the disturbance of its own step is taken, as in notebook 06: with the mean m and the
-        standard deviation s of the next normalised error it is exp(-(beta m)^2 / w) / sqrt(w), w = 1 + 2 (beta s)^2. That has the same
-        mean as the reward, a smaller variance, and a gradient where the reward itself has none.
+        standard deviation s of the next normalised error it is exp(-(beta m)^2 / w) / sqrt(w), w = 1 + 2 (beta s)^2. That has the
+        same mean as the reward, a smaller variance, and a gradient where the reward itself has none.
         """
         process, scale = self.session.process, self.error_scale(scenarios.set_point)
         spread = process.disturbance(run.x[:-1]) * process.sampling_time**0.5
@@ -144,7 +150,7 @@ class Ground:
 
 
 def enter(session: Session) -> Ground:
-    """What notebook 09 starts from: the parameters of all cases, params/limits.yaml and params/one_policy.yaml. No earlier result."""
+    """What notebook 09 starts from: the parameters of all cases, limits.yaml and one_policy.yaml, and no earlier result."""
     root = session.params_root
     cases = {case: replace(session, case=case, params=load(root, case)) for case in sorted(load_published(root))}
     grids = load_limits(root, session.params).robustness
@@ -162,7 +168,8 @@ def trained(
     """Improve a policy in place by the gradient through the process, without an episode of the plant.
 
     Args:
-        robust: A, B and loads are drawn too. constrained: the inputs move no more than the record's PID moves them in the same episodes.
+        robust: A, B and loads are drawn too. constrained: the inputs move no more than the record's PID moves them in the same
+            episodes.
         first_beta: where beta begins, if not at that of the objective; it rises evenly in its logarithm.
     """
     generator, params = ground.session.stream("one_policy", purpose), ground.params
@@ -174,8 +181,8 @@ def trained(
         if first_beta is not None:
             beta = first_beta * (beta / first_beta) ** min(1.0, len(done) / (params.hot_start.share * steps))
         with torch.no_grad():
-            allowed = track(VelocityPID(ground.record), scenarios, ground.bounds).movement.sum(0).mean(0)
-        return ground.lost(scenarios, run, beta), run.movement.sum(0) / allowed / params.descent.movement
+            allowed = params.descent.movement * ground.moved(track(VelocityPID(ground.record), scenarios, ground.bounds).u).mean()
+        return ground.lost(scenarios, run, beta), ground.moved(run.u) / allowed
 
     def note(record: GradientRecord) -> None:
         done.append(record)
@@ -196,7 +203,7 @@ def learn(ground: Ground, purpose: str, robust: bool = False, constrained: bool 
         records = trained(ground, policy, purpose, steps, robust, constrained, watch=ProgressBar(steps, purpose))
         return {"policy": policy.state_dict(), "records": [asdict(record) for record in records]}
 
-    kept = ground.session.once(train, "one_policy", purpose, robust, constrained)
+    kept = ground.session.once(train, ground.params, purpose, robust, constrained)
     policy.load_state_dict(kept["policy"])
     return policy, pd.DataFrame(kept["records"])
 
@@ -205,17 +212,17 @@ def starts(ground: Ground) -> tuple[pd.DataFrame, pd.DataFrame]:
     """What the hot start brings: the same training from the demonstrating PID and from nothing.
 
     Returns:
-        The curves (start, steps, share: of minimum variance, mean over the cases), and a row a start: share at the start, the lowest
-        after it (the dip), at the end, and the gradient steps until the level of the parameter file was reached, nan if never.
+        The curves (start, steps, share: of minimum variance, mean over the cases), and a row a start: share at the start, the
+        lowest (the dip), at the end, and the gradient steps until the level of the parameter file was reached, nan if never.
     """
     params, scale = ground.params.hot_start, ground.scale
     nothing = Gains(0 * ground.record.proportional, NONE * ground.record.integral, 0 * ground.record.derivative)
     rows: list[tuple[str, int, float]] = []
-    best = {case: returns(ground, study, study.minimum_variance, scale.grid)[0] for case, study in ground.cases.items()}
+    best = [returns(ground, study, study.minimum_variance, scale.grid)[0] for study in ground.cases.values()]
 
     def share(policy: TrackingPolicy) -> float:
-        ratios = [returns(ground, study, AtSetPoint(policy, study.task), scale.grid)[0] / best[case] for case, study in ground.cases.items()]
-        return sum(ratios) / len(ratios)
+        found = [returns(ground, study, AtSetPoint(policy, study.task), scale.grid)[0] for study in ground.cases.values()]
+        return sum(value / most for value, most in zip(found, best, strict=True)) / len(best)
 
     for name, gains, first_beta in (
         ("PID of the demonstrations", ground.record, None),
@@ -236,8 +243,8 @@ def starts(ground: Ground) -> tuple[pd.DataFrame, pd.DataFrame]:
     table = {}
     for name, curve in curves.groupby("start", sort=False):
         reached = curve.loc[curve["share"] >= params.level, "steps"]
-        first, last = curve["share"].iloc[0], curve["share"].iloc[-1]
-        table[name] = {"at the start": first, "lowest": curve["share"].min(), "at the end": last, "steps to the level": reached.min()}
+        first, last, least = curve["share"].iloc[0], curve["share"].iloc[-1], curve["share"].min()
+        table[name] = {"at the start": first, "lowest": least, "at the end": last, "steps to the level": reached.min()}
     return curves, pd.DataFrame(table).T
 
 
@@ -277,7 +284,7 @@ def judged(ground: Ground, trackers: Mapping[str, Tracker]) -> pd.DataFrame:
         found = {"minimum_variance": (best, None), "expert": (pid, record)}
         found |= {name: returns(ground, study, AtSetPoint(tracker, study.task), number) for name, tracker in trackers.items()}
         for name, (value, batch) in found.items():
-            moved = torch.nan if batch is None else (total_variation(batch.u) / total_variation(record.u)).mean().item()
+            moved = torch.nan if batch is None else (ground.moved(batch.u).mean() / ground.moved(record.u).mean()).item()
             rows.append((group, case, f"{row:g}", f"{column:g}", name, value, value / best, moved, held))
     columns = ["group", "case", "row", "column", "controller", "objective", "share", "movement", "held"]
     return pd.DataFrame(rows, columns=columns)
@@ -289,12 +296,14 @@ def goals(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
     by = ["controller", "case"]
     at = {group: rows.groupby(by, sort=False) for group, rows in table.groupby("group")}
     corners = table[(table["group"] == "model") & table["held"]].groupby(by, sort=False)["share"]
-    return pd.DataFrame({
-        "J(30)": at["case"]["objective"].mean(),
-        "share": at["case"]["share"].mean(),
-        "movement": at["case"]["movement"].mean(),
-        "set points, mean": at["set_point"]["share"].mean(),
-        "set points, least": at["set_point"]["share"].min(),
-        "corners held": corners.count(),
-        "corners, least": corners.min(),
-    })
+    return pd.DataFrame(
+        {
+            "J(30)": at["case"]["objective"].mean(),
+            "share": at["case"]["share"].mean(),
+            "movement": at["case"]["movement"].mean(),
+            "set points, mean": at["set_point"]["share"].mean(),
+            "set points, least": at["set_point"]["share"].min(),
+            "corners held": corners.count(),
+            "corners, least": corners.min(),
+        }
+    )

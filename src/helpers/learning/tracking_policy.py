@@ -138,8 +138,8 @@ class TrackingPolicy(nn.Module):
 class PatientPolicy(TrackingPolicy):
     """The same, for plants whose inputs sit at their bounds for long: it does not leave a bound as soon as the error shrinks.
 
-    u_t = u_{t-1} + k (asked_{t-1} - clip(asked_{t-1})) + ..., where k in (0, 1) is learned: with k = 0 it is the velocity form, with
-    k = 1 a PID without anti-windup, between them back-calculation (Astrom and Hagglund 2006, Section 3.5).
+    u_t = u_{t-1} + k (asked_{t-1} - clip(asked_{t-1})) + ..., where k in (0, 1) is learned: with k = 0 it is the velocity form,
+    with k = 1 a PID without anti-windup, between them back-calculation (Astrom and Hagglund 2006, Section 3.5).
 
     Args:
         kept: k at the start.

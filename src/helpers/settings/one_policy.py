@@ -5,7 +5,19 @@ from typing import Annotated
 
 from pydantic import Field
 
-from helpers.settings.leaf import Count, Leaf, Memory, NotNegative, ParameterError, Positive, Record, Share, Text, read_yaml, validate
+from helpers.settings.leaf import (
+    Count,
+    Leaf,
+    Memory,
+    NotNegative,
+    ParameterError,
+    Positive,
+    Record,
+    Share,
+    Text,
+    read_yaml,
+    validate,
+)
 from helpers.settings.paper import Params
 
 

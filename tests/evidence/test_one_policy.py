@@ -30,6 +30,8 @@ def test_the_range_of_set_points_holds_every_case_and_the_grid(ground):
     drawn = ground.draw(2000, stream(0, "episodes"))
     assert (drawn.set_point >= ground.set_points.amin(0)).all()
     assert (drawn.set_point <= ground.set_points.amax(0)).all()
+    above = (drawn.set_point[0, :, 0] > 0.5).double().mean().item()  # Case II, and what lies anywhere
+    assert abs(above - (0.5 / 3 + 0.5 * 0.75 / 4.375)) < 0.05
     assert drawn.process is ground.session.process
     assert not drawn.load.any()
     assert torch.equal(drawn.set_point[0], drawn.set_point[-1])

@@ -92,7 +92,7 @@ class Ground:
         return PatientPolicy(*shape, kept) if kept else TrackingPolicy(*shape)
 
     def draw(self, n_episodes: int, generator: torch.Generator, margin: float = 0.0, load: float = 0.0) -> Scenarios:
-        """Episodes from u* = 0 with a set point each, drawn evenly from the range of the grid.
+        """Episodes from u* = 0 with a set point each: a case's times factors within the grid's, or any in the range of the grid.
 
         Args:
             margin: A and B of each episode are scaled by factors within it. load: std of a load step, as a share of the inputs'
@@ -104,7 +104,13 @@ class Ground:
         even = partial(torch.rand, generator=generator, dtype=session.dtype)
         n_steps, n_x, n_u = task.n_steps, process.n_states, process.n_inputs
         low, high = self.set_points.amin(0), self.set_points.amax(0)
-        set_point = low + (high - low) * even((n_episodes, len(low)))
+        anywhere = low + (high - low) * even((n_episodes, len(low)))
+        least, most = min(self.set_point_factors), max(self.set_point_factors)
+        targets = torch.stack([study.task.set_point for study in self.cases.values()])
+        near = targets[torch.randint(len(targets), (n_episodes,), generator=generator)] * (
+            least + (most - least) * even((n_episodes, len(low)))
+        )
+        set_point = torch.where(even((n_episodes, 1)) < self.params.episodes.near, near, anywhere)
         state, entry = 1 + margin * (2 * even((2, n_episodes)) - 1)
         begins = torch.randint(2 * n_steps, (n_episodes,), generator=generator)
         step = load * self.bounds.span * normal((n_episodes, n_u))

@@ -24,6 +24,7 @@ from helpers.settings.paper import Params
 class EpisodeParams(Record):
     """What is drawn for each episode beside its set point."""
 
+    near: Annotated[NotNegative, Field(le=1), Leaf("share")]
     margin: Annotated[Memory, Leaf("share of A and of B")]
     load: Annotated[NotNegative, Leaf("input range")]
 

@@ -1,4 +1,4 @@
-# The runs beyond the paper's own: inferred settings, claims, limits and alternatives (notebooks 00, 08 and 06).
+# The runs beyond the paper's own: inferred settings, claims, limits and alternatives, one policy for all cases (notebooks 00, 08, 06 and 09).
 def learned(wildcards):
     """The results of notebooks 01 to 04 for a case."""
     kinds = ("offline", "transfer", "online") if wildcards.case == "3" else ("offline", "online")
@@ -41,3 +41,15 @@ rule limits:
     priority: -2
     shell:
         run("06_limits_and_alternatives", "case", "seed")
+
+
+rule one_policy:
+    input:
+        made_from("09_one_policy", record("one_policy", f"{SEED}/case_1")),
+    output:
+        record("one_policy", f"{SEED}/case_1"),
+    log:
+        f"{SEED}/notebooks/09_one_policy.ipynb",
+    priority: -1
+    shell:
+        run("09_one_policy", "seed")

@@ -37,9 +37,10 @@ def code_of(notebook):
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
 
 
-def test_the_nine_notebooks_are_there():
+def test_the_ten_notebooks_are_there():
     names = ["00_inferred_settings", "01_demonstrations", "02_offline_irl", "03_online_improvement"]
     names += ["04_knowledge_transfer", "05_report", "06_limits_and_alternatives", "07_your_own_process", "08_claims"]
+    names += ["09_one_policy"]
     assert sorted(NOTEBOOKS) == names
 
 

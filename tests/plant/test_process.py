@@ -41,6 +41,21 @@ def test_mean_and_covariance_of_one_step(study, dt):
     assert abs(np.corrcoef(error.T)[0, 1]) < 5 / np.sqrt(n)  # the Wiener processes of the loops are independent
 
 
+def test_factors_of_each_trajectory_are_processes_of_their_own(study):
+    generator = stream(0, "factors")
+    x, u, noise, factors = (torch.randn(3, 2, generator=generator, dtype=F64) for _ in range(4))
+    state, entry = 1 + 0.3 * factors.T
+    process = study().process
+    found = process.scaled(state, entry)
+    for k in range(3):
+        changes = {"drift_state": state[k].item() * A, "drift_input": entry[k].item() * B}
+        alone = study(process={name: tuple(map(tuple, matrix)) for name, matrix in changes.items()}).process
+        rows = x[k : k + 1], u[k : k + 1]
+        torch.testing.assert_close(found.step(x, u, noise)[k : k + 1], alone.step(*rows, noise[k : k + 1]), rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(found.drift(x, u)[k : k + 1], alone.drift(*rows), rtol=1e-12, atol=1e-12)
+    assert torch.equal(process.drift_state, torch.tensor(A))  # the process itself is as it was
+
+
 @pytest.mark.equation("4.1.3")
 def test_without_noise_the_step_converges_to_first_order(study):
     exact = solve_ivp(lambda _, x: A @ x + B @ U0, (0, 2), X0, rtol=1e-10, atol=1e-12).y[:, -1]

@@ -33,6 +33,7 @@ from helpers.runs.sources import PROJECT
 from helpers.settings.evidence import load_experiments, load_identification
 from helpers.settings.leaf import InputError, read_yaml
 from helpers.settings.limits import load_limits
+from helpers.settings.one_policy import load_one_policy
 from helpers.settings.paper import load, load_published
 
 CASES = int(os.environ.get("CASES", "60"))
@@ -46,6 +47,7 @@ NOTEBOOKS = {
     "06_limits_and_alternatives": 1,
     "07_your_own_process": 1,
     "08_claims": 2,
+    "09_one_policy": 1,
 }  # and the case with which each is run
 NAMES = (("C_A", "T"), ("C_A0", "T_E"))
 
@@ -167,6 +169,7 @@ def load_everything(root):
     load_identification(root, params[1])
     load_claims(root)
     load_limits(root, params[1])
+    load_one_policy(root, params[1])
     load_own_plant(root)
     load_tank(root, params[1].process)
     for notebook, case in NOTEBOOKS.items():

@@ -133,3 +133,33 @@ class TrackingPolicy(nn.Module):
         correction = self.output(signal) * half
         moves = torch.cat([error, once, twice], dim=-1) @ self.law.mT
         return u_previous + moves + correction - before, (error, once, correction, *after)
+
+
+class PatientPolicy(TrackingPolicy):
+    """The same, for plants whose inputs sit at their bounds for long: it does not leave a bound as soon as the error shrinks.
+
+    u_t = u_{t-1} + k (asked_{t-1} - clip(asked_{t-1})) + ..., where k in (0, 1) is learned: with k = 0 it is the velocity form,
+    with k = 1 a PID without anti-windup, between them back-calculation (Astrom and Hagglund 2006, Section 3.5).
+
+    Args:
+        kept: k at the start.
+    """
+
+    def __init__(
+        self, params: PolicyParams, gains: Gains, unit: Tensor, centre: Tensor, reach: Tensor, bounds: Bounds, kept: float
+    ) -> None:
+        super().__init__(params, gains, unit, centre, reach, bounds)
+        self.kept_logit = nn.Parameter(torch.full_like(bounds.low, kept).logit())
+
+    def start(self, n_trajectories: int) -> tuple[Tensor, ...]:
+        """What the bounds have cut off, which is nothing, before the other memory."""
+        return self.low.new_zeros(n_trajectories, len(self.low)), *super().start(n_trajectories)
+
+    def act(
+        self, y: Tensor, set_point: Tensor, u_previous: Tensor, memory: tuple[Tensor, ...]
+    ) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """The command and the memory for the next sample."""
+        excess, *rest = memory
+        command, after = super().act(y, set_point, u_previous, tuple(rest))
+        command = command + torch.sigmoid(self.kept_logit) * excess
+        return command, (command - command.clamp(self.low, self.high), *after)

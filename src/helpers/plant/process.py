@@ -1,5 +1,6 @@
 """The controlled process: a linear stochastic differential equation and the balances behind it, Section 4.1."""
 
+import copy
 from typing import Protocol
 
 import torch
@@ -30,7 +31,8 @@ class LinearProcess:
     x_{t+1} = x_t + (A x_t + B u_t) dt + diag(d) x_t sqrt(dt) w_t,  y_t = (1 + s v_t) x_t,  w, v ~ N(0, I).
 
     Attributes:
-        state_step, input_step: I + A dt (n_x, n_x) and B dt (n_x, n_u), the expected step of one sample.
+        state_step, input_step: I + A dt (n_x, n_x) and B dt (n_x, n_u), the expected step of one sample; where `scaled`, one a
+            trajectory (K, n_x, n_x) and (K, n_x, n_u).
     """
 
     def __init__(self, params: ProcessParams, dtype: torch.dtype) -> None:
@@ -47,9 +49,17 @@ class LinearProcess:
         self.input_step = self.drift_input * self.sampling_time
         self._disturbance_step = self.disturbance_gain * self.sampling_time**0.5
 
+    def scaled(self, state: Tensor, entry: Tensor) -> "LinearProcess":
+        """This process with A and B of Eq. 4.1.3b times factors of each trajectory, (K,) each."""
+        other = copy.copy(self)
+        other.drift_state, other.drift_input = state[:, None, None] * self.drift_state, entry[:, None, None] * self.drift_input
+        other.state_step = torch.eye(self.n_states, dtype=state.dtype) + other.drift_state * self.sampling_time
+        other.input_step = other.drift_input * self.sampling_time
+        return other
+
     def drift(self, x: Tensor, u: Tensor) -> Tensor:
         """h(x, u) of Eq. 4.1.3b, shape (K, n_x), per unit of time."""
-        return x @ self.drift_state.T + u @ self.drift_input.T
+        return _product(self.drift_state, x) + _product(self.drift_input, u)
 
     def disturbance(self, x: Tensor) -> Tensor:
         """delta(x) of Eq. 4.1.3c, shape (K, n_x), per square root of time: it vanishes at the steady state."""
@@ -57,11 +67,18 @@ class LinearProcess:
 
     def step(self, x: Tensor, u: Tensor, noise: Tensor) -> Tensor:
         """The next state by Euler-Maruyama, Eq. 4.1.3a: x + h(x, u) dt + delta(x) sqrt(dt) noise."""
+        if self.state_step.ndim == 3:
+            return x * noise * self._disturbance_step + _product(self.state_step, x) + _product(self.input_step, u)
         return (x * noise).mul_(self._disturbance_step).addmm_(x, self.state_step.T).addmm_(u, self.input_step.T)
 
     def observe(self, x: Tensor, noise: Tensor) -> Tensor:
         """The observation of Eq. 4.1.4b: each output is read with a relative error."""
         return torch.addcmul(x, x * noise, self.observation_noise)
+
+
+def _product(matrix: Tensor, vectors: Tensor) -> Tensor:
+    """One matrix (n, m), or one for each of K vectors (K, n, m), times vectors (K, m)."""
+    return vectors @ matrix.T if matrix.ndim == 2 else (matrix @ vectors[..., None])[..., 0]
 
 
 def linearised_balances(groups: BalanceParams) -> tuple[list[list[float]], list[list[float]]]:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from helpers.plant.process import Process
+from helpers.plant.task import ControlTask
 
 
 class Bounds(NamedTuple):
@@ -93,3 +94,23 @@ def track(tracker: Tracker, scenarios: Scenarios, bounds: Bounds) -> Tracked:
         inputs.append(u)
         outputs.append(process.observe(states[t + 1], noise[t + 1]))
     return Tracked(torch.stack(states), torch.stack(outputs), torch.stack(inputs), scenarios.before, scenarios.set_point)
+
+
+class AtSetPoint:
+    """A tracker as the controller of one task, for `rollout`: its set point stands still and the input begins at u* = 0.
+
+    The memory is the input applied last, (K, n_u), and the tracker's own.
+    """
+
+    def __init__(self, tracker: Tracker, task: ControlTask) -> None:
+        self.tracker = tracker
+        self.task = task
+
+    def start(self, n_trajectories: int, n_steps: int, generator: torch.Generator) -> tuple[Tensor, Any]:
+        """Before the first sample."""
+        return self.task.input_low.new_zeros(n_trajectories, len(self.task.input_low)), self.tracker.start(n_trajectories)
+
+    def act(self, observation: Tensor, memory: tuple[Tensor, Any]) -> tuple[Tensor, tuple[Tensor, Any]]:
+        """The tracker's command for one sample."""
+        command, own = self.tracker.act(observation, self.task.set_point.expand_as(observation), *memory)
+        return command, (command.clamp(self.task.input_low, self.task.input_high), own)

@@ -1,0 +1,130 @@
+"""The gradient through the model against finite differences and against what REINFORCE expects; the price on movement."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.learning.learner import TrainingError
+from helpers.learning.model_gradient import PATIENCE, Descent, differentiable, model_gradient
+from helpers.learning.tracking_policy import Gains, TrackingPolicy
+from helpers.plant.rollout import stream
+from helpers.plant.tracking import Bounds, Scenarios, track
+
+ONE = Descent(steps=1, longest=torch.inf, price=0.0, price_step=0.0)
+
+
+@pytest.fixture
+def case(study):
+    return study()
+
+
+def bounds(case):
+    return Bounds(case.task.input_low, case.task.input_high, torch.full_like(case.task.input_low, torch.inf))
+
+
+def fresh(case):
+    """A policy with a random output layer."""
+    torch.manual_seed(0)
+    unit = case.task.error_scale.abs()
+    gains = Gains(*(torch.tensor(values, dtype=case.dtype).diag() for values in ([4.0, 5.0], [0.5, 1.0], [0.1, 0.2])))
+    policy = TrackingPolicy(case.params.learning.policy, gains, unit, case.task.set_point, unit, bounds(case))
+    with torch.no_grad():
+        policy.output.weight.normal_(std=0.1)
+    return policy
+
+
+def episodes(case, n, n_steps, set_point, load=0.0):
+    generator = stream(0, "episodes")
+    start, w, v = (torch.randn(m, n, 2, generator=generator, dtype=case.dtype) for m in (1, n_steps, n_steps + 1))
+    target = torch.tensor(set_point, dtype=case.dtype).expand(n_steps, n, 2)
+    return Scenarios(case.process, target, torch.zeros_like(w) + load, 0.1 * start[0], 0 * start[0], w, v)
+
+
+def squared(scenarios, run):
+    """Mean square error on the true state, and no movement."""
+    error = (scenarios.set_point - run.x[1:]).square().mean((0, 2))
+    return error, torch.zeros_like(error)
+
+
+def test_the_gradient_is_that_of_finite_differences(case):
+    policy, drawn = fresh(case), episodes(case, 4, 8, [-0.2, 0.5])
+    before = {name: value.clone() for name, value in policy.state_dict().items()}
+    model_gradient(policy, lambda: drawn, squared, bounds(case), ONE)
+    gradient = {name: parameter.grad for name, parameter in policy.named_parameters()}
+    for seed in range(4):
+        generator = stream(seed, "direction")
+        way = {name: torch.randn(value.shape, generator=generator, dtype=case.dtype) for name, value in gradient.items()}
+        costs = []
+        for length in (1e-6, -1e-6):
+            policy.load_state_dict(before | {name: before[name] + length * step for name, step in way.items()})
+            with torch.no_grad():
+                costs.append(squared(drawn, track(policy, drawn, bounds(case)))[0].mean().item())
+        expected = sum((gradient[name] * step).sum().item() for name, step in way.items())
+        np.testing.assert_allclose((costs[0] - costs[1]) / 2e-6, expected, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.equation("3.2.4")
+def test_reinforce_expects_the_same_gradient(case):
+    """One step with the input drawn about the policy's, u ~ N(mu, sigma^2): E[cost grad ln pi] against that through the model.
+
+    The draw of the input is the load, which the process adds to the policy's mean.
+    """
+    n, sigma = 40_000, 1.5
+    noise = torch.randn(1, n, 2, generator=stream(0, "exploration"), dtype=case.dtype)
+    drawn = replace(episodes(case, n, 1, [-0.2, 0.5], load=sigma * noise), start=torch.full((n, 2), 0.1, dtype=case.dtype))
+    policy = fresh(case)
+    half = (policy.high - policy.low) / 2  # d mu / d bias of the output layer
+    with torch.no_grad():
+        run = track(policy, drawn, bounds(case))
+        cost = squared(drawn, run)[0]
+    assert (run.u > policy.low).all()
+    assert (run.u < policy.high).all()
+    samples = (cost - cost.mean())[:, None] * noise[0] / sigma * half
+    model_gradient(policy, lambda: drawn, squared, bounds(case), ONE)
+    error = (samples.mean(0) - policy.output.bias.grad).abs()
+    spread = samples.std(0) / n**0.5
+    assert (error < 5 * spread).all()
+    assert (policy.output.bias.grad.abs() > 10 * spread).all(), "the test could not tell it from zero"
+
+
+def test_the_price_on_movement_rises_while_there_is_too_much_and_falls_after(case):
+    """Dual ascent, and movement that ends where it is allowed."""
+
+    def measure(scenarios, run):
+        return squared(scenarios, run)[0], run.movement.sum(0).mean(-1) / 8.0
+
+    policy, drawn = fresh(case), episodes(case, 16, 10, [-0.5, 2.0])
+    descent = Descent(steps=120, rate_start=2e-2, price=0.0, price_step=0.2)
+    records = model_gradient(policy, lambda: drawn, measure, bounds(case), descent)
+    prices, moved = [record.price for record in records], [record.movement for record in records]
+    expected = [max(0.0, price + 0.2 * (m - descent.slack)) for price, m in zip(prices, moved, strict=True)]
+    np.testing.assert_allclose(prices[1:], expected[:-1], rtol=1e-12)
+    assert moved[0] > 1.1
+    assert np.mean(moved[-20:]) < 1.0
+
+
+def test_whether_a_process_can_be_differentiated(case):
+    class Opaque:
+        n_states, n_inputs = 2, 2
+
+        def step(self, x, u, noise):
+            return torch.from_numpy(u.detach().numpy() * 2)
+
+    process = type(case.process)(case.params.process, torch.float32)
+    assert differentiable(process)
+    assert not differentiable(Opaque())
+
+
+def test_a_cost_that_stays_not_finite_ends_the_training(case):
+    seen = []
+
+    def measure(scenarios, run):
+        seen.append(1)
+        cost = squared(scenarios, run)[0]
+        return cost * torch.nan, cost
+
+    with pytest.raises(TrainingError, match="is not finite"):
+        model_gradient(fresh(case), lambda: episodes(case, 2, 3, [-0.2, 0.5]), measure, bounds(case), Descent(steps=50))
+    assert len(seen) == PATIENCE + 1

@@ -9,6 +9,7 @@ import torch
 from helpers.learning.learner import TrainingError
 from helpers.learning.model_gradient import PATIENCE, Descent, differentiable, model_gradient
 from helpers.learning.tracking_policy import Gains, TrackingPolicy
+from helpers.own_plant.tank import example
 from helpers.plant.rollout import stream
 from helpers.plant.tracking import Bounds, Scenarios, track
 
@@ -105,18 +106,6 @@ def test_the_price_on_movement_rises_while_there_is_too_much_and_falls_after(cas
     assert np.mean(moved[-20:]) < 1.0
 
 
-def test_whether_a_process_can_be_differentiated(case):
-    class Opaque:
-        n_states, n_inputs = 2, 2
-
-        def step(self, x, u, noise):
-            return torch.from_numpy(u.detach().numpy() * 2)
-
-    process = type(case.process)(case.params.process, torch.float32)
-    assert differentiable(process)
-    assert not differentiable(Opaque())
-
-
 def test_a_cost_that_stays_not_finite_ends_the_training(case):
     seen = []
 
@@ -128,3 +117,12 @@ def test_a_cost_that_stays_not_finite_ends_the_training(case):
     with pytest.raises(TrainingError, match="is not finite"):
         model_gradient(fresh(case), lambda: episodes(case, 2, 3, [-0.2, 0.5]), measure, bounds(case), Descent(steps=50))
     assert len(seen) == PATIENCE + 1
+
+
+def test_a_process_that_torch_cannot_differentiate_is_refused_in_one_sentence(case):
+    tank, zero = example(), torch.zeros(1, 2)
+    assert differentiable(case.process, zero.double(), zero.double())
+    assert not differentiable(tank, zero, zero)
+    scenarios = Scenarios(tank, *[torch.zeros(1, 1, 2)] * 2, zero, zero, *[torch.zeros(2, 1, 2)] * 2)
+    with pytest.raises(TrainingError, match="torch cannot differentiate this process"):
+        model_gradient(torch.nn.Linear(1, 1), lambda: scenarios, None, None, Descent(1))

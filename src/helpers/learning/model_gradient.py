@@ -54,9 +54,9 @@ class Descent:
     slack: float = 0.95
 
 
-def differentiable(process: Process) -> bool:
-    """Whether torch can differentiate the step of a process in its input."""
-    u, x = torch.zeros(1, process.n_inputs, requires_grad=True), torch.zeros(1, process.n_states)
+def differentiable(process: Process, x: Tensor, u: Tensor) -> bool:
+    """Whether torch can differentiate the step of a process from states (K, n_x) in its inputs (K, n_u)."""
+    u = u.detach().clone().requires_grad_()
     try:
         return process.step(x, u, torch.zeros_like(x)).requires_grad
     except RuntimeError:  # numpy takes no tensor that carries a gradient
@@ -83,6 +83,10 @@ def model_gradient(
         for group in optimiser.param_groups:
             group["lr"] = annealed(descent.rate_start, descent.rate_end, step / max(1, descent.steps - 1))
         scenarios = draw()
+        if step == 0 and not differentiable(scenarios.process, scenarios.start, scenarios.before):
+            raise TrainingError(
+                "torch cannot differentiate this process, so there is no gradient through it: take REINFORCE (Algorithm 1)"
+            )
         cost, movement = (part.mean() for part in measure(scenarios, track(policy, scenarios, bounds)))
         optimiser.zero_grad()
         (cost + price * (movement - descent.slack)).backward()

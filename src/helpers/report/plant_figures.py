@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, ScalarFormatter
+from matplotlib.ticker import MaxNLocator
 from statsmodels.tsa.stattools import acf
 
 from helpers.learning.model_gradient import GradientRecord
@@ -107,14 +107,11 @@ def gate_figure(verdict: Verdict) -> Figure:
         order = [name for name in SIMPLEST if name != RECORD]
         seaborn.boxenplot(
             frame, x=what, y="controller", hue="controller", order=order, hue_order=order, palette=list(CANDIDATES[1:]),
-            legend=False, log_scale=True, ax=axis,
+            legend=False, ax=axis,
         )  # fmt: skip
         axis.axvline(1.0, color=INK, linewidth=1.0, linestyle="--")
         axis.set_xlabel(label)
         axis.set_ylabel("")
-        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.xaxis.set_major_formatter(ScalarFormatter())
-        axis.xaxis.set_minor_locator(NullLocator())
     return figure
 
 

@@ -43,7 +43,7 @@ def judge(
     """Every candidate on the same episodes of models held out, several of each after each other; `quiet` ones tell the offset.
 
     Args:
-        candidates: by name, the record's PID among them. allowed: movement, as a multiple of that of the record's PID.
+        candidates: by name, the record's PID first. allowed: movement, as a multiple of that of the record's PID.
     """
     rows, errors, models = {}, {}, []
     with torch.no_grad():

@@ -151,7 +151,7 @@ class Workshop:
     """Everything that controllers are tuned, trained and judged on.
 
     Attributes:
-        operation: the range of set points, the loops and the bounds. record: the PID of the record, and `explained` of its moves.
+        operation: the range of set points, the loops and the bounds. record: its PID; `explained`: by a fitted one.
         nominal: the most likely model. training, held_out: models drawn for learning and for the gate, from different members.
     """
 

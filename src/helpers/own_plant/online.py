@@ -72,18 +72,19 @@ class Improvement:
         )
 
 
+def from_rest(process: Process, set_point: Tensor, load: Tensor, generator: torch.Generator) -> Scenarios:
+    """Episodes of whatever stands for the plant, from its steady state; set points (T, K, n_y) and loads (T, K, n_u)."""
+    n_steps, n_episodes, _ = set_point.shape
+    sizes = (n_steps, n_episodes, process.n_states), (n_steps + 1, n_episodes, process.n_outputs)
+    noise = [torch.randn(size, generator=generator, dtype=set_point.dtype) for size in sizes]
+    start, before = set_point.new_zeros(n_episodes, process.n_states), set_point.new_zeros(n_episodes, process.n_inputs)
+    return Scenarios(process, set_point, load, start, before, *noise)
+
+
 def plant_episodes(workshop: Workshop, process: Process, n_episodes: int, generator: torch.Generator) -> Scenarios:
     """Episodes of the plant at its steady state, with set points of the range that its nominal model can hold, and a load step."""
-    index = torch.zeros(n_episodes, dtype=torch.long)
-    drawn = workshop.draw(workshop.nominal.members(index[:1]), n_episodes, generator)
-    dtype = workshop.operation.unit.dtype
-    n_steps = len(drawn.set_point)
-    sizes = (n_steps, n_episodes, process.n_states), (n_steps + 1, n_episodes, process.n_outputs)
-    noise = [torch.randn(size, generator=generator, dtype=dtype) for size in sizes]
-    return Scenarios(
-        process, drawn.set_point, drawn.load, torch.zeros(n_episodes, process.n_states, dtype=dtype),
-        torch.zeros(n_episodes, process.n_inputs, dtype=dtype), *noise,
-    )  # fmt: skip
+    drawn = workshop.draw(workshop.nominal, n_episodes, generator)
+    return from_rest(process, drawn.set_point, drawn.load, generator)
 
 
 def improve_on_plant(workshop: Workshop, identified: Identified, policy: TrackingPolicy, process: Process) -> Improvement:
@@ -139,17 +140,10 @@ def at_set_points(
     set_points = torch.zeros(len(places), len(operation.low), dtype=dtype)
     loops = list(operation.loops)
     set_points[:, loops] = operation.low[loops] + places * (operation.high - operation.low)[loops]
-    n_episodes, n_steps = len(set_points) * n_repeats, workshop.n_steps
-    generator = workshop.plant.stream("set points")
-    noise = [
-        torch.randn(n, n_episodes, size, generator=generator, dtype=dtype)
-        for n, size in ((n_steps, process.n_states), (n_steps + 1, process.n_outputs))
-    ]
-    zero = torch.zeros(n_episodes, process.n_inputs, dtype=dtype)
-    scenarios = Scenarios(
-        process, set_points.repeat_interleave(n_repeats, 0).expand(n_steps, -1, -1), zero.expand(n_steps, -1, -1),
-        torch.zeros(n_episodes, process.n_states, dtype=dtype), zero, *noise,
-    )  # fmt: skip
+    n_steps = workshop.n_steps
+    aimed = set_points.repeat_interleave(n_repeats, 0).expand(n_steps, -1, -1)
+    no_load = aimed.new_zeros(n_steps, aimed.shape[1], process.n_inputs)
+    scenarios = from_rest(process, aimed, no_load, workshop.plant.stream("set points"))
     steady, rows = workshop.plant.description.steady("controlled", dtype), []
     for name, tracker in candidates.items():
         with torch.no_grad():

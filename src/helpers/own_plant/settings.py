@@ -97,7 +97,6 @@ class PlantLearningParams(Record):
 
     offline_epochs: Annotated[Count, Leaf("epochs")]
     error_unit: Annotated[Positive, Leaf("error scale")]
-    beta: Annotated[Positive, Leaf("-")]
 
 
 class OwnPlantParams(Record):

@@ -139,8 +139,8 @@ def work(path: Path, folder: Path, params_root: Path, scale: str, seed: int) -> 
         f"{len(plant.clean.table)} samples, {len(plant.clean.findings)} findings, {found.trajectories.n_trajectories} episodes of "
         f"{plant.description.horizon} samples",
         *(f"left out: {number} episodes ({reason})" for reason, number in found.left_out.items() if number),
-        f"the controller of the record: {'as described' if plant.description.pid else 'a PID found in it'}, which explains "
-        f"{100 * workshop.explained:.0f} % of the moves of its inputs",
+        f"the controller of the record: the PID {'of the description' if plant.description.pid else 'found in it'}; a PID that is "
+        f"fitted to the record explains {100 * workshop.explained:.0f} % of the moves of the inputs",
         *(f"warning: {words}" for words in (*identified.warnings, *validation.warnings)),
     ]
     if verdict.released:

@@ -10,11 +10,11 @@ from helpers.settings.leaf import (
     Leaf,
     Memory,
     NotNegative,
-    ParameterError,
     Positive,
     Record,
     Share,
     Text,
+    check_scales,
     read_yaml,
     validate,
 )
@@ -74,7 +74,5 @@ def load_one_policy(root: Path, params: Params) -> OnePolicyParams:
     """
     path = root / "one_policy.yaml"
     record = validate(OnePolicyParams, read_yaml(path), path)
-    for scale in params.learning.scales:
-        if scale not in record.scales:
-            raise ParameterError(f"{path}: key 'scales.{scale}': the key is missing")
+    check_scales(path, params.learning.scales, record.scales)
     return record

@@ -151,7 +151,8 @@ class Workshop:
     """Everything that controllers are tuned, trained and judged on.
 
     Attributes:
-        operation: the range of set points, the loops and the bounds. record: its PID; `explained`: by a fitted one.
+        operation: the range of set points, the loops and the bounds. record: its PID.
+        explained: share of the moves of the inputs that a PID fitted to the record explains.
         nominal: the most likely model. training, held_out: models drawn for learning and for the gate, from different members.
     """
 

@@ -8,7 +8,7 @@ import torch
 
 from helpers.evidence import one_policy
 from helpers.learning.features import discounts, tracking_reward
-from helpers.learning.tracking_policy import VelocityPID
+from helpers.learning.tracking_policy import TrackingPID
 from helpers.plant.rollout import stream
 from helpers.plant.tracking import track
 from helpers.runs.session import open_session
@@ -57,7 +57,7 @@ def test_the_cost_has_the_mean_of_the_objective(ground):
     drawn = ground.draw(n, stream(1, "episodes"))
     case = ground.cases[1]
     drawn = replace(drawn, set_point=case.task.set_point.expand_as(drawn.set_point))
-    run = track(VelocityPID(ground.record), drawn, ground.bounds)
+    run = track(TrackingPID(ground.record), drawn, ground.bounds)
     reward = tracking_reward((case.task.set_point - run.x[1:]) / case.task.error_scale, ground.beta)
     weights = discounts(len(reward), 0.99, reward)
     sampled, expected = 1 - weights @ reward / (2 * weights.sum()), ground.lost(drawn, run, ground.beta)

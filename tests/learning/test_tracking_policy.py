@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from helpers.learning.tracking_policy import Gains, PatientPolicy, TrackingPolicy, VelocityPID
+from helpers.learning.tracking_policy import Gains, TrackingPID, TrackingPolicy
 from helpers.plant.controllers import PID
 from helpers.plant.rollout import rollout, stream
 from helpers.plant.tracking import AtSetPoint, Bounds, Scenarios, track
@@ -36,12 +36,15 @@ def bounds(case, wider=1.0):
     return Bounds(wider * case.task.input_low, wider * case.task.input_high, infinite)
 
 
-def fresh(case, seed=None, kept=None, parts=PARTS):
-    """A policy whose output layer is zero, or random with a seed; `kept`: of a patient one."""
+def tracking_pid(case, parts=PARTS, wider=1.0):
+    return TrackingPID(gains(parts), bounds(case, wider))
+
+
+def fresh(case, seed=None):
+    """A policy whose output layer is zero, or random with a seed."""
     torch.manual_seed(0 if seed is None else seed)
     unit = case.task.error_scale.abs()
-    shape = (case.params.learning.policy, gains(parts), unit, case.task.set_point, unit, bounds(case))
-    policy = TrackingPolicy(*shape) if kept is None else PatientPolicy(*shape, kept)
+    policy = TrackingPolicy(case.params.learning.policy, gains(), unit, case.task.set_point, unit, bounds(case))
     if seed is not None:
         with torch.no_grad():
             for parameter in policy.output.parameters():
@@ -64,67 +67,75 @@ def test_with_an_output_layer_of_zero_it_is_the_pid(study):
     drawn = episodes(case, case.task.set_point.expand(40, 2))
     noise = torch.randn(41, 3, 2, generator=stream(1, "noise"), dtype=case.dtype)
     drawn = replace(drawn, noise=noise, disturbance=noise[1:])
-    found, expected = (track(tracker, drawn, bounds(case)) for tracker in (policy, VelocityPID(gains())))
+    with torch.no_grad():
+        policy.kept_logit.fill_(-torch.inf)
+    found, expected = (track(tracker, drawn, bounds(case)) for tracker in (policy, tracking_pid(case)))
     torch.testing.assert_close(found.u, expected.u, rtol=1e-10, atol=1e-10)
-    torch.testing.assert_close(policy.gains.law, gains().law)
+    for found_part, part in zip(vars(policy.gains).values(), vars(gains()).values(), strict=True):
+        torch.testing.assert_close(found_part, part)
 
 
-def test_away_from_the_bounds_the_velocity_form_is_the_pid_of_the_paper(study):
-    """Without derivative action: at the first sample the paper's PID has none, and the velocity form has."""
+def test_away_from_the_bounds_it_is_the_pid_of_the_paper(study):
+    """Without derivative action: at the first sample the paper's PID has none, and the form in increments has."""
     case = study(process={"input_low": (-1e4, -1e4), "input_high": (1e4, 1e4)})
     parts = (PARTS[0], PARTS[1], [0.0, 0.0])
     runs = [
         rollout(case.process, controller, case.task, 4, stream(0, "episodes"))
-        for controller in (AtSetPoint(VelocityPID(gains(parts)), case.task), paper_pid(case, parts))
+        for controller in (AtSetPoint(tracking_pid(case, parts), case.task), paper_pid(case, parts))
     ]
     torch.testing.assert_close(runs[0].u, runs[1].u, rtol=1e-9, atol=1e-9)
 
 
-def test_what_keeps_all_that_a_bound_cuts_off_is_the_pid_of_the_paper(study):
-    """Which goes on integrating at a bound; and what keeps nothing is the velocity form."""
-    case, parts = study(), (PARTS[0], PARTS[1], [0.0, 0.0])
-    runs = {
-        name: rollout(case.process, controller, case.task, 4, stream(0, "episodes")).u
-        for name, controller in {
-            "paper": paper_pid(case, parts),
-            "all": AtSetPoint(fresh(case, kept=1 - 1e-13, parts=parts), case.task),
-            "velocity": AtSetPoint(VelocityPID(gains(parts)), case.task),
-            "nothing": AtSetPoint(fresh(case, kept=1e-13, parts=parts), case.task),
-        }.items()
-    }
-    torch.testing.assert_close(runs["all"], runs["paper"], rtol=1e-7, atol=1e-7)
-    torch.testing.assert_close(runs["nothing"], runs["velocity"], rtol=1e-7, atol=1e-7)
-    assert (runs["paper"] - runs["velocity"]).abs().max() > 1
+def test_the_input_that_was_applied_counts(case):
+    """An input moved by hand: the integral goes on from there, without a jump."""
+    controller, still = tracking_pid(case), torch.zeros(1, 2, dtype=case.dtype)
+    command, memory = controller.act(still, still, still, controller.start(1))
+    assert torch.equal(command, still)
+    by_hand = torch.tensor([[5.0, -7.0]], dtype=case.dtype)
+    command, memory = controller.act(still, still, by_hand, memory)
+    torch.testing.assert_close(command, by_hand)
 
 
-@pytest.mark.parametrize("kept", [None, 0.8])
+def test_noise_near_a_bound_does_not_move_the_mean(study):
+    """What a form without memory of the excess does: every command that is cut off shifts the next ones."""
+    case = study(process={"observation_noise": (0.3, 0.0)})
+    target = torch.tensor([-2.2, 0.0], dtype=case.dtype)  # held by an input near its bound
+    u = -torch.linalg.solve(case.process.drift_input, case.process.drift_state @ target)
+    assert -20 < u[0] < -16
+    drawn = episodes(case, target.expand(900, 2), n=40)
+    drawn = replace(drawn, noise=torch.randn(901, 40, 2, generator=stream(1, "noise"), dtype=case.dtype))
+    run = track(tracking_pid(case, ([10.0, 10.0], [0.3, 0.3], [0.0, 0.0])), drawn, bounds(case))
+    assert (run.u[300:, :, 0] == -20).double().mean() > 0.1
+    assert (target - run.x[300:].mean((0, 1)))[0].abs() < 0.05
+
+
 @pytest.mark.parametrize("seed", range(3))
-def test_whatever_the_network_has_learned_no_offset_stays(case, seed, kept):
-    policy = fresh(case, seed, kept)
+def test_whatever_the_network_has_learned_no_offset_stays(case, seed):
+    policy = fresh(case, seed)
     with torch.no_grad():
         run = track(policy, episodes(case, case.task.set_point.expand(600, 2), load=0.7), bounds(case))
     assert run.movement[-1].max() < 1e-7, "a random network that is stable here"
     assert run.error[-1].abs().max() < 1e-6
-    start = track(VelocityPID(gains()), episodes(case, case.task.set_point.expand(600, 2), load=0.7), bounds(case))
+    start = track(tracking_pid(case), episodes(case, case.task.set_point.expand(600, 2), load=0.7), bounds(case))
     assert (run.u[:20] - start.u[:20]).abs().max() > 0.1, "and that does something"
 
 
-@pytest.mark.parametrize(("seed", "kept"), [(None, None), (0, None), (1, 0.8)])
-def test_nothing_winds_up_at_a_bound(case, seed, kept):
+@pytest.mark.parametrize("seed", [None, 0, 1])
+def test_nothing_winds_up_at_a_bound(case, seed):
     """A set point out of reach, for long or for very long: afterwards the same response."""
     far, near = (torch.tensor(target, dtype=case.dtype) for target in ([-8.0, 4.0], [-1.0, 4.0]))
     responses = []
     for waiting in (300, 900):
         drawn = episodes(case, torch.cat([far.expand(waiting, 2), near.expand(60, 2)]))
         with torch.no_grad():
-            run = track(fresh(case, seed, kept), drawn, bounds(case))
+            run = track(fresh(case, seed), drawn, bounds(case))
         assert torch.equal(run.u[waiting - 1, :, 0], torch.full((3,), -20.0, dtype=case.dtype))
         responses.append(run.x[waiting:])
     torch.testing.assert_close(responses[0], responses[1], rtol=1e-6, atol=1e-6)
 
 
 def test_every_parameter_is_learned(case):
-    policy = fresh(case, 0, kept=0.8)
+    policy = fresh(case, 0)
     run = track(policy, episodes(case, case.task.set_point.expand(30, 2)), bounds(case))
     run.error.square().mean().backward()
     still = [name for name, parameter in policy.named_parameters() if parameter.grad is None or not parameter.grad.any()]

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from helpers import __main__ as command
-from helpers.learning.tracking_policy import VelocityPID
-from helpers.own_plant import gate, learn, online
+from helpers.own_plant import learn, online
 from helpers.own_plant.deploy import DeployedPolicy
 from helpers.own_plant.description import load_description
 from helpers.own_plant.operation import described_gains, recorded_gains
@@ -77,8 +76,7 @@ def test_the_whole_chain_runs_for_any_number_of_variables(n_y, n_u, tmp_path, ro
     tuned, predictive = learn.tune(workshop)
     policy, records = learn.learn_policy(workshop, tuned)
     assert len(records) == 4
-    candidates = {gate.RECORD: VelocityPID(workshop.record), gate.TUNED: VelocityPID(tuned), gate.PREDICTIVE: predictive}
-    verdict = learn.pass_gate(workshop, candidates | {gate.POLICY: policy})
+    verdict = learn.pass_gate(workshop, learn.candidates(workshop, tuned, predictive, policy))
     assert verdict.words.startswith("verdict: ")
     assert np.isfinite(verdict.table.drop(columns="passes").astype(float)).all(axis=None)
     assert plant_report.export_policy(workshop, policy, tmp_path) < 1e-5

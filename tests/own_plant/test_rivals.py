@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.learning.tracking_policy import Gains, VelocityPID
+from helpers.learning.tracking_policy import Gains, TrackingPID
 from helpers.own_plant.gate import POLICY, RECORD, TUNED, judge
 from helpers.own_plant.identify import Equation, Margins, Structure, apart, assemble
 from helpers.own_plant.operation import Operation, draw_scenarios
@@ -49,7 +49,7 @@ def price(error, movement):
 
 def test_scenarios_start_at_rest_and_can_be_held(operation, params):
     drawn = scenarios(operation, params, quiet=True)
-    still = track(VelocityPID(pid(0.0, 0.0)), drawn, operation.bounds)
+    still = track(TrackingPID(pid(0.0, 0.0), operation.bounds), drawn, operation.bounds)
     assert still.y[20].numpy() == pytest.approx(still.y[0].numpy(), abs=1e-4)
     assert (still.y[-1] - still.y[0]).abs().max() > 1  # the load
     assert (drawn.set_point.abs() <= 10).all()
@@ -73,7 +73,9 @@ def test_the_simc_rule_is_that_of_the_literature():
 def test_the_re_tuned_pid_is_better_than_the_record_s_on_all_models(operation, params):
     drawn, record = scenarios(operation, params), pid(0.5, 0.05)
     tuned = tuned_pid(models(1, 0.0), drawn, record, operation, price, params.rivals, seed=0)
-    errors = [operation.error(track(VelocityPID(gains), drawn, operation.bounds)).mean() for gains in (record, tuned)]
+    errors = [
+        operation.error(track(TrackingPID(gains, operation.bounds), drawn, operation.bounds)).mean() for gains in (record, tuned)
+    ]
     assert errors[1] < 0.8 * errors[0]
     assert (tuned.integral > 0).all()
 
@@ -89,17 +91,11 @@ def test_predictive_control_leaves_no_offset_where_its_model_is_wrong(operation,
 
 def test_the_gate_releases_what_is_better_and_nothing_else(operation, params):
     noisy, quiet = (scenarios(operation, params, still) for still in (False, True))
-    slow, good = VelocityPID(pid(0.5, 0.05)), VelocityPID(pid(1.5, 0.12))
+    slow, good = TrackingPID(pid(0.5, 0.05), operation.bounds), TrackingPID(pid(1.5, 0.12), operation.bounds)
 
     def verdict(policy, allowed, **others):
-        return judge(
-            {RECORD: slow, **others, POLICY: policy},
-            noisy,
-            quiet,
-            operation,
-            allowed,
-            params.gate.model_copy(update={"episodes": 1}),
-        )
+        one_each = params.gate.model_copy(update={"episodes": 1, "corner_episodes": 1})
+        return judge({RECORD: slow, **others, POLICY: policy}, (noisy, quiet, noisy), operation, allowed, one_each)
 
     better = verdict(good, 10.0)
     assert better.released
@@ -108,11 +104,25 @@ def test_the_gate_releases_what_is_better_and_nothing_else(operation, params):
     assert len(better.models) == 32
     assert not verdict(good, 0.5).released
     assert "times as much" in verdict(good, 0.5).words
-    worse = verdict(VelocityPID(pid(0.2, 0.02)), 10.0)
+    worse = verdict(TrackingPID(pid(0.2, 0.02), operation.bounds), 10.0)
     assert worse.words.startswith("verdict: keep the PID: the policy is not released: it is better on only ")
-    drifting = verdict(VelocityPID(pid(3.0, 0.0)), 10.0)
+    drifting = verdict(TrackingPID(pid(3.0, 0.0), operation.bounds), 10.0)
     assert "it leaves an offset of" in drifting.words
     as_good = verdict(good, 10.0, **{TUNED: good})
     assert as_good.released
     assert as_good.keep == TUNED
     assert f"but {TUNED} is as good and simpler" in as_good.words
+
+
+def test_a_controller_that_fails_at_an_end_of_the_margins_is_not_released(operation, params):
+    """A gain that suits the model, and not one of almost twice its gain."""
+    noisy, quiet = (scenarios(operation, params, still, n_models=32, gain=0.0) for still in (False, True))
+    corners = scenarios(operation, params, n_models=32, gain=0.9)
+    slow, hot = TrackingPID(pid(0.5, 0.05), operation.bounds), TrackingPID(pid(6.0, 0.3), operation.bounds)
+    one_each = params.gate.model_copy(update={"episodes": 1, "corner_episodes": 1})
+    fine, bad = (
+        judge({RECORD: slow, POLICY: hot}, (noisy, quiet, third), operation, 100.0, one_each) for third in (noisy, corners)
+    )
+    assert fine.released
+    assert not bad.released
+    assert "at an end of the margins its mean |e| is" in bad.words

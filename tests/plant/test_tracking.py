@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from helpers.learning.tracking_policy import Gains, VelocityPID
+from helpers.learning.tracking_policy import Gains, TrackingPID
 from helpers.plant.rollout import rollout, stream
 from helpers.plant.tracking import AtSetPoint, Bounds, Scenarios, track
 
@@ -32,7 +32,8 @@ def case(study):
 
 @pytest.fixture
 def pid(case):
-    return VelocityPID(Gains(*(torch.tensor(gains, dtype=case.dtype).diag() for gains in ([9.0, 8.0], [1.0, 3.0], [0.5, 0.2]))))
+    gains = Gains(*(torch.tensor(gains, dtype=case.dtype).diag() for gains in ([9.0, 8.0], [1.0, 3.0], [0.5, 0.2])))
+    return TrackingPID(gains, bounds(case))
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import torch
 from matplotlib.figure import Figure
 
 from helpers.learning.model_gradient import GradientRecord
-from helpers.learning.tracking_policy import Gains, VelocityPID
+from helpers.learning.tracking_policy import Gains, TrackingPID
 from helpers.own_plant import gate, learn
 from helpers.own_plant.commissioning import Trial, commission
 from helpers.own_plant.guard import Guard
@@ -50,9 +50,11 @@ def test_an_episode_is_shown_in_engineering_units_under_every_controller(plant, 
     bounds = Bounds(torch.tensor([-3.0, -3.0]), torch.tensor([3.0, 3.0]), torch.full((2,), torch.inf))
     operation = Operation((0,), none - 1, none + 1, none + 1, bounds)
     record = Gains(*(torch.eye(2, 3) for _ in range(3)))
-    workshop = learn.Workshop(plant, operation, record, 1.0, *[model.to(torch.float32)] * 3)
+    workshop = learn.Workshop(plant, operation, record, 1.0, *[model.to(torch.float32)] * 4)
     figure = plant_figures.loops_figure(
-        workshop, {gate.RECORD: VelocityPID(record), gate.POLICY: VelocityPID(record)}, plant.description
+        workshop,
+        {gate.RECORD: TrackingPID(record, workshop.operation.bounds), gate.POLICY: TrackingPID(record, workshop.operation.bounds)},
+        plant.description,
     )
     shown = drawn_summary(figure).set_index(["panel", "artist"])
     assert [axis.get_label() for axis in figure.axes] == [*plant.controlled, *plant.manipulated]

@@ -12,7 +12,7 @@ from helpers.evidence.robustness import mismatched
 from helpers.learning.evaluation import objective
 from helpers.learning.features import discounts
 from helpers.learning.model_gradient import Descent, GradientRecord, model_gradient
-from helpers.learning.tracking_policy import Gains, PatientPolicy, TrackingPolicy, VelocityPID
+from helpers.learning.tracking_policy import Gains, TrackingPID, TrackingPolicy
 from helpers.plant.controllers import Controller
 from helpers.plant.task import Trajectories
 from helpers.plant.tracking import AtSetPoint, Bounds, Scenarios, Tracked, Tracker, track
@@ -81,15 +81,13 @@ class Ground:
         least = self.set_points.abs().amin(0)
         return torch.where(set_point < 0, -1.0, 1.0) * set_point.abs().maximum(least)
 
-    def policy(self, gains: Gains, kept: float | None = None) -> TrackingPolicy:
-        """A policy that begins as the PID with these gains; `kept`: of `PatientPolicy`, as in the parameter file unless given."""
+    def policy(self, gains: Gains) -> TrackingPolicy:
+        """A policy that begins as the PID with these gains."""
         # torch.nn draws the first weights from the global stream.
         torch.manual_seed(int(torch.randint(2**31, (1,), generator=self.session.stream("one_policy", "weights"))))
         low, high = self.set_points.amin(0), self.set_points.amax(0)
         unit = self.session.task.error_scale.abs()
-        shape = (self.session.params.learning.policy, gains, unit, (low + high) / 2, (high - low) / 2, self.bounds)
-        kept = self.params.descent.kept if kept is None else kept
-        return PatientPolicy(*shape, kept) if kept else TrackingPolicy(*shape)
+        return TrackingPolicy(self.session.params.learning.policy, gains, unit, (low + high) / 2, (high - low) / 2, self.bounds)
 
     def draw(self, n_episodes: int, generator: torch.Generator, margin: float = 0.0, load: float = 0.0) -> Scenarios:
         """Episodes from u* = 0 with a set point each: a case's times factors within the grid's, or any in the range of the grid.
@@ -187,7 +185,10 @@ def trained(
         if first_beta is not None:
             beta = first_beta * (beta / first_beta) ** min(1.0, len(done) / (params.hot_start.share * steps))
         with torch.no_grad():
-            allowed = params.descent.movement * ground.moved(track(VelocityPID(ground.record), scenarios, ground.bounds).u).mean()
+            allowed = (
+                params.descent.movement
+                * ground.moved(track(TrackingPID(ground.record, ground.bounds), scenarios, ground.bounds).u).mean()
+            )
         return ground.lost(scenarios, run, beta), ground.moved(run.u) / allowed
 
     def note(record: GradientRecord) -> None:

@@ -1,8 +1,11 @@
-"""One policy for a range of set points: a PID in velocity form plus what a recurrent network adds to it.
+"""One policy for a range of set points: a PID plus what a recurrent network adds to it.
 
-u_t = u_{t-1} + P (e_t - e_{t-1}) + I e_t + D (e_t - 2 e_{t-1} + e_{t-2}) + c_t - c_{t-1}, with e = y_sp - y and c_t the network's
-correction. At rest c does not change, so that I e = 0: no offset stays, whatever the network has learned. The input before is
-the one that was applied, so that nothing winds up at a bound. Where the network's output layer is zero the policy is the PID.
+u_t = clip(s_t + q_t) with q_t = P e_t + D (e_t - e_{t-1}) + c_t and the integral s_t, where e = y_sp - y, and c_t is the network's
+correction. At rest neither q nor s changes, so that I e = 0: no offset stays, whatever was learned. Of what s_{t-1} + I e_t exceeds
+the bounds of the input a share k is kept (back-calculation, Astrom and Hagglund 2006, Section 3.5): nothing winds up for long, and
+with k = 0 nothing at all. What the bounds cut off q is not lost, so that noise near a bound shifts nothing, as it does in the usual
+velocity form. s_{t-1} is u_{t-1} + (what was cut off then) - q_{t-1} with the input that was applied: whoever moves it by hand
+hands over without a jump. Where the network's output layer and k are zero this is a PID.
 """
 
 from dataclasses import dataclass
@@ -15,6 +18,7 @@ from helpers.plant.tracking import Bounds
 from helpers.settings.paper import PolicyParams
 
 SHARPNESS = 10.0  # asinh(10 e) tells small errors apart and does not run away for large ones
+KEPT = 0.8  # k at the start; learned from there on
 
 
 @dataclass(frozen=True)
@@ -25,31 +29,55 @@ class Gains:
     integral: Tensor
     derivative: Tensor
 
-    @property
-    def law(self) -> Tensor:
-        """The PID in velocity form as one matrix on (e_t, e_{t-1}, e_{t-2}), shape (..., n_u, 3 n_y)."""
-        p, i, d = self.proportional, self.integral, self.derivative
-        return torch.cat([p + i + d, -p - 2 * d, d], dim=-1)
+    def command(
+        self,
+        error: Tensor,
+        u_previous: Tensor,
+        memory: tuple[Tensor, ...],
+        bounds: Bounds,
+        correction: Tensor | float = 0.0,
+        kept: Tensor | float = 0.0,
+    ) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """The command (K, n_u) of the module's formula, and the memory after it.
+
+        Args:
+            error: at this sample, (K, n_y). u_previous: the input applied last, (K, n_u). correction: of the network, (K, n_u).
+            kept: k, (n_u,). memory: the error one sample before, what the bounds cut off the last command, and q.
+        """
+        once, excess, quick = memory
+        integral = u_previous + excess - quick + _times(self.integral, error)
+        within = integral.clamp(bounds.low, bounds.high)
+        integral = within + kept * (integral - within)
+        quick = _times(self.proportional, error) + _times(self.derivative, error - once) + correction
+        command = integral + quick
+        return command, (error, command - command.clamp(bounds.low, bounds.high), quick)
+
+    def start(self, n_trajectories: int) -> tuple[Tensor, ...]:
+        """The memory before the first sample: zero."""
+        n_u, n_y = self.integral.shape[-2:]
+        return tuple(self.integral.new_zeros(n_trajectories, width) for width in (n_y, n_u, n_u))
 
 
-class VelocityPID:
-    """A PID in velocity form for many set points; before the first sample the error is zero."""
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    return (matrix @ vector[..., None])[..., 0]
 
-    def __init__(self, gains: Gains) -> None:
-        self.law = gains.law
 
-    def start(self, n_trajectories: int) -> tuple[Tensor, Tensor]:
-        """No error before."""
-        zero = self.law.new_zeros(n_trajectories, self.law.shape[-1] // 3)
-        return zero, zero
+class TrackingPID:
+    """A PID for many set points; its memory is that of `Gains.command`."""
+
+    def __init__(self, gains: Gains, bounds: Bounds) -> None:
+        self.gains = gains
+        self.bounds = bounds
+
+    def start(self, n_trajectories: int) -> tuple[Tensor, ...]:
+        """No error before, and nothing cut off."""
+        return self.gains.start(n_trajectories)
 
     def act(
-        self, y: Tensor, set_point: Tensor, u_previous: Tensor, memory: tuple[Tensor, Tensor]
-    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        self, y: Tensor, set_point: Tensor, u_previous: Tensor, memory: tuple[Tensor, ...]
+    ) -> tuple[Tensor, tuple[Tensor, ...]]:
         """The law at one sample."""
-        error = set_point - y
-        errors = torch.cat([error, *memory], dim=-1)
-        return u_previous + (self.law @ errors[..., None])[..., 0], (error, memory[0])
+        return self.gains.command(set_point - y, u_previous, memory, self.bounds)
 
 
 class TrackingPolicy(nn.Module):
@@ -94,6 +122,7 @@ class TrackingPolicy(nn.Module):
         self.proportional = nn.Parameter(gains.proportional / self._scale)
         self.derivative = nn.Parameter(gains.derivative / self._scale)
         self.integral_log = nn.Parameter(torch.zeros_like(gains.integral))  # the integral action keeps its sign and never vanishes
+        self.kept_logit = nn.Parameter(torch.full_like(bounds.low, KEPT).logit())
 
     @property
     def lstms(self) -> list[nn.LSTM]:
@@ -105,24 +134,28 @@ class TrackingPolicy(nn.Module):
         return (self.high - self.low)[:, None] / 2 / self.unit
 
     @property
+    def kept(self) -> Tensor:
+        """k, (n_u,)."""
+        return torch.sigmoid(self.kept_logit)
+
+    @property
     def gains(self) -> Gains:
         """The PID inside."""
         scale = self._scale
         return Gains(self.proportional * scale, self.integral * self.integral_log.exp(), self.derivative * scale)
 
     def start(self, n_trajectories: int) -> tuple[Tensor, ...]:
-        """Zero: errors one and two samples before, the correction before, and h and c of each layer."""
-        self.law = self.gains.law  # once an episode
-        n_u, n_y = self.integral.shape
-        widths = [n_y, n_y, n_u, *(width for width in self.params.hidden_cells for _ in "hc")]
-        return tuple(self.unit.new_zeros(n_trajectories, width) for width in widths)
+        """Zero: the memory of `Gains.command`, and h and c of each layer."""
+        self.pid, self.k = self.gains, self.kept  # once an episode
+        self.bounds = Bounds(self.low, self.high, torch.full_like(self.low, torch.inf))
+        widths = (width for width in self.params.hidden_cells for _ in "hc")
+        return *self.pid.start(n_trajectories), *(self.unit.new_zeros(n_trajectories, width) for width in widths)
 
     def act(
         self, y: Tensor, set_point: Tensor, u_previous: Tensor, memory: tuple[Tensor, ...]
     ) -> tuple[Tensor, tuple[Tensor, ...]]:
         """The command and the memory for the next sample."""
-        error = set_point - y
-        once, twice, before, *states = memory
+        error, (pid, states) = set_point - y, (memory[:3], memory[3:])
         middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
         seen = [torch.asinh(SHARPNESS * error / self.unit), (set_point - self.centre) / self.reach, (u_previous - middle) / half]
         signal = torch.cat(seen, dim=-1)
@@ -130,36 +163,5 @@ class TrackingPolicy(nn.Module):
         for index, layer in enumerate(self.lstms):
             after += torch.lstm_cell(signal, states[2 * index : 2 * index + 2], *layer.all_weights[0])
             signal = functional.leaky_relu(after[-2], self.params.leaky_slope)
-        correction = self.output(signal) * half
-        moves = torch.cat([error, once, twice], dim=-1) @ self.law.mT
-        return u_previous + moves + correction - before, (error, once, correction, *after)
-
-
-class PatientPolicy(TrackingPolicy):
-    """The same, for plants whose inputs sit at their bounds for long: it does not leave a bound as soon as the error shrinks.
-
-    u_t = u_{t-1} + k (asked_{t-1} - clip(asked_{t-1})) + ..., where k in (0, 1) is learned: with k = 0 it is the velocity form,
-    with k = 1 a PID without anti-windup, between them back-calculation (Astrom and Hagglund 2006, Section 3.5).
-
-    Args:
-        kept: k at the start.
-    """
-
-    def __init__(
-        self, params: PolicyParams, gains: Gains, unit: Tensor, centre: Tensor, reach: Tensor, bounds: Bounds, kept: float
-    ) -> None:
-        super().__init__(params, gains, unit, centre, reach, bounds)
-        self.kept_logit = nn.Parameter(torch.full_like(bounds.low, kept).logit())
-
-    def start(self, n_trajectories: int) -> tuple[Tensor, ...]:
-        """What the bounds have cut off, which is nothing, before the other memory."""
-        return self.low.new_zeros(n_trajectories, len(self.low)), *super().start(n_trajectories)
-
-    def act(
-        self, y: Tensor, set_point: Tensor, u_previous: Tensor, memory: tuple[Tensor, ...]
-    ) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """The command and the memory for the next sample."""
-        excess, *rest = memory
-        command, after = super().act(y, set_point, u_previous, tuple(rest))
-        command = command + torch.sigmoid(self.kept_logit) * excess
-        return command, (command - command.clamp(self.low, self.high), *after)
+        command, pid = self.pid.command(error, u_previous, pid, self.bounds, self.output(signal) * half, self.k)
+        return command, (*pid, *after)

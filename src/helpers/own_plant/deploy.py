@@ -33,7 +33,10 @@ class PolicyStep(nn.Module):
     deviation is taken before anything is rounded.
     """
 
-    law: Tensor
+    proportional: Tensor
+    integral: Tensor
+    derivative: Tensor
+    kept: Tensor
     unit: Tensor
     centre: Tensor
     reach: Tensor
@@ -48,8 +51,8 @@ class PolicyStep(nn.Module):
         super().__init__()
         self.cells = list(policy.params.hidden_cells)
         self.slope = policy.params.leaky_slope
-        doubles = {"law": policy.gains.law, "steady_y": steady_y, "steady_u": steady_u}
-        doubles |= {name: getattr(policy, name) for name in ("unit", "centre", "reach", "low", "high")}
+        doubles = {**vars(policy.gains), "steady_y": steady_y, "steady_u": steady_u}
+        doubles |= {name: getattr(policy, name) for name in ("kept", "unit", "centre", "reach", "low", "high")}
         for name, value in doubles.items():
             self.register_buffer(name, value.detach().double())
         singles = {"output_weight": policy.output.weight, "output_bias": policy.output.bias}
@@ -60,8 +63,8 @@ class PolicyStep(nn.Module):
             self.register_buffer(name, value.detach().float())
 
     def forward(self, y: Tensor, set_point: Tensor, u_previous: Tensor, *memory: Tensor) -> tuple[Tensor, ...]:
-        """The input to apply, (K, n_u), and the memory for the next sample: two errors, the correction, h and c of each layer."""
-        once, twice, before, *states = memory
+        """The input to apply, (K, n_u), and the memory for the next sample, as in `memory_names`."""
+        once, excess, quick, *states = memory
         error = set_point - y
         middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
         scaled = SHARPNESS * error / self.unit
@@ -80,15 +83,22 @@ class PolicyStep(nn.Module):
             after += [hidden, cell]
             signal = functional.leaky_relu(hidden, self.slope)
         correction = functional.linear(signal, self.output_weight, self.output_bias).double() * half
-        command = last + torch.cat([error, once, twice], dim=-1) @ self.law.T + correction - before
-        u = torch.minimum(torch.maximum(command, self.low), self.high) + self.steady_u
-        return (u, error, once, correction, *after)
+        integral = last + excess - quick + error @ self.integral.T
+        within = self.within(integral)
+        integral = within + self.kept * (integral - within)
+        quick = error @ self.proportional.T + (error - once) @ self.derivative.T + correction
+        u = self.within(integral + quick)
+        return (u + self.steady_u, error, integral + quick - u, quick, *after)
+
+    def within(self, command: Tensor) -> Tensor:
+        """Clipped to the bounds of the inputs."""
+        return torch.minimum(torch.maximum(command, self.low), self.high)
 
 
 def memory_names(policy: TrackingPolicy) -> list[str]:
-    """The errors one and two samples before, the correction before, and h and c of each layer, as the file calls them."""
+    """The error before, what a bound cut off, the quick part q before, and h and c of each layer, as the file calls them."""
     states = [f"{kind}_{index}" for index in range(len(policy.lstms)) for kind in "hc"]
-    return ["error_1", "error_2", "correction", *states]
+    return ["error", "excess", "quick", *states]
 
 
 def export(

@@ -20,7 +20,8 @@ class Verdict:
 
     Attributes:
         table: a row a controller: mean |e| and movement as shares of those of the record's PID, share of the models on which it
-            is better, offset as a share of the range, whether it passes. models: the first two on each model, a row each.
+            is better, offset as a share of the range, mean |e| in the worst corner of the margins, whether it passes. models: the
+            first two on each model, a row each.
         released: whether the policy passes. keep: the controller to keep. words: the sentence that says so.
     """
 
@@ -38,14 +39,18 @@ def offsets(run: Tracked, operation: Operation) -> torch.Tensor:
 
 
 def judge(
-    candidates: Mapping[str, Tracker], noisy: Scenarios, quiet: Scenarios, operation: Operation, allowed: float, params: GateParams
-) -> Verdict:
-    """Every candidate on the same episodes of models held out, several of each after each other; `quiet` ones tell the offset.
+    candidates: Mapping[str, Tracker], episodes: tuple[Scenarios, Scenarios, Scenarios], operation: Operation, allowed: float,
+    params: GateParams,
+) -> Verdict:  # fmt: skip
+    """Every candidate on the same episodes.
 
     Args:
         candidates: by name, the record's PID first. allowed: movement, as a multiple of that of the record's PID.
+        episodes: of models held out, several of each after each other; undisturbed ones, which tell the offset; and
+            `corner_episodes` of each corner of the margins.
     """
-    rows, errors, models = {}, {}, []
+    noisy, quiet, corners = episodes
+    rows, errors, at_corners, models = {}, {}, {}, []
     with torch.no_grad():
         for name, tracker in candidates.items():
             run = track(tracker, noisy, operation.bounds)
@@ -56,15 +61,20 @@ def judge(
                 moved = movement
             parts = {"mean |e|": errors[name] / errors[RECORD], "movement": movement / moved}
             models.append(pd.DataFrame(parts).assign(controller=name))
+            at_corners[name] = (
+                operation.error(track(tracker, corners, operation.bounds)).double().reshape(-1, params.corner_episodes)
+            )
             rest = offsets(track(tracker, quiet, operation.bounds), operation)
             rows[name] = {
                 "mean |e|": (errors[name] / errors[RECORD]).mean().item(),
                 "movement": (movement.mean() / moved.mean()).item(),
                 "better": (errors[name] < errors[RECORD]).double().mean().item(),
                 "offset": rest.nan_to_num(torch.inf).quantile(params.better).item(),
+                "worst corner": (at_corners[name] / at_corners[RECORD]).nan_to_num(torch.inf).max().item(),
             }
     table = pd.DataFrame(rows).T
     fine = (table["better"] >= params.better) & (table["movement"] <= allowed) & (table["offset"] <= params.offset)
+    fine &= table["worst corner"] <= 1
     table["passes"] = fine
     released = bool(fine.get(POLICY, False))
     passing = [name for name in SIMPLEST if name in rows and (name == RECORD or fine[name])]
@@ -93,6 +103,7 @@ def _words(table: pd.DataFrame, released: bool, keep: str, allowed: float, param
             (policy["better"] < params.better, f"it is better on only {100 * policy['better']:.0f} % of the models"),
             (policy["movement"] > allowed, f"it moves the inputs {policy['movement']:.2f} times as much"),
             (policy["offset"] > params.offset, f"it leaves an offset of {100 * policy['offset']:.1f} % of the range"),
+            (policy["worst corner"] > 1, f"at an end of the margins its mean |e| is {100 * policy['worst corner']:.0f} %"),
         )
         if bad
     ]

@@ -9,6 +9,7 @@ greatest likelihood on records held out. The uncertainty is an ensemble: the sam
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 import torch
@@ -333,6 +334,13 @@ class Margins:
     dead_time: tuple[int, ...]
 
     @classmethod
+    def ends(cls, params: MarginParams, n_inputs: int) -> "list[Margins]":
+        """Every corner: all gains, the time constants and all dead times at an end of their margins."""
+        gains, times = ([1 - margin, 1 + margin] for margin in (params.gain, params.time))
+        found = product(gains, times, sorted({0, params.dead_time}))
+        return [cls(np.full(n_inputs, gain), time, (dead_time,) * n_inputs) for gain, time, dead_time in found]
+
+    @classmethod
     def draw(cls, params: MarginParams, n_inputs: int, rng: np.random.Generator) -> "Margins":
         """Within the declared margins and often at their ends, so that the corners count too."""
         more = tuple(int(number) for number in rng.integers(0, params.dead_time + 1, n_inputs))
@@ -410,13 +418,20 @@ class Identified:
     candidates: tuple[dict[Structure, float], ...]
     warnings: tuple[str, ...]
 
-    def ensemble(self, margins: MarginParams, n_models: int, seed: int) -> ArmaxModel:
-        """Models drawn from the members, each as far off as the margins allow."""
+    def ensemble(self, margins: MarginParams, n_models: int, seed: int, at_ends: float = 0.0) -> ArmaxModel:
+        """Models drawn from the members, each as far off as the margins allow; a share of them `at_ends`, corner after corner."""
         rng = np.random.default_rng(seed)
         drawn = rng.integers(0, len(self.members), n_models)
         n_u = len(self.scales[1])
-        chosen = [(self.members[index], Margins.draw(margins, n_u, rng)) for index in drawn]
+        ends, n_ends = Margins.ends(margins, n_u), round(at_ends * n_models)
+        off = [ends[k % len(ends)] if k < n_ends else Margins.draw(margins, n_u, rng) for k in range(n_models)]
+        chosen = zip((self.members[index] for index in drawn), off, strict=True)
         return assemble([[apart(equation, margin) for equation in member] for member, margin in chosen], self.scales)
+
+    def corners(self, margins: MarginParams) -> ArmaxModel:
+        """The model with every gain, every time constant and every dead time at an end of its margin."""
+        found = Margins.ends(margins, len(self.scales[1]))
+        return assemble([[apart(equation, margin) for equation in self.equations] for margin in found], self.scales)
 
 
 def spread_of(record: Record, structure: Structure, parameters: Array) -> Array:

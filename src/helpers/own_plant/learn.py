@@ -13,10 +13,10 @@ from torch import Tensor
 
 from helpers.learning.algorithm_2 import Apprenticeship
 from helpers.learning.model_gradient import Descent, GradientRecord, model_gradient
-from helpers.learning.tracking_policy import Gains, TrackingPolicy, VelocityPID
+from helpers.learning.tracking_policy import Gains, TrackingPID, TrackingPolicy
+from helpers.own_plant import gate
 from helpers.own_plant.description import PlantDescription, load_description
 from helpers.own_plant.episodes import Episodes, episodes, stretches
-from helpers.own_plant.gate import Verdict, judge
 from helpers.own_plant.identify import Identified, Validation, hold_out, identify, thin_out, validate_model
 from helpers.own_plant.model import ArmaxModel
 from helpers.own_plant.operation import Operation, described_gains, draw_scenarios, operation, recorded_gains
@@ -35,7 +35,8 @@ from helpers.settings.paper import Params, ScaleParams, load
 
 PIECE = 5  # episodes: how long the pieces of a long record are that the model is identified from
 HELD, FEWEST = 0.2, 0.25  # |e| in units of the range within which a loop that is held settles; least share of such models
-HARM = 8.0  # how many times more an error counts that goes beyond that of the record's PID
+AT_ENDS = 0.3  # share of the models of training at the ends of the declared margins
+HARM = 20.0  # how many times more an error counts that goes beyond that of the record's PID
 SLACK, BEYOND = 0.95, 10.0  # share of the allowed movement that is aimed at, and the price of more while the rivals are tuned
 
 
@@ -154,6 +155,7 @@ class Workshop:
         operation: the range of set points, the loops and the bounds. record: its PID.
         explained: share of the moves of the inputs that a PID fitted to the record explains.
         nominal: the most likely model. training, held_out: models drawn for learning and for the gate, from different members.
+        corners: the most likely model at the ends of the declared margins.
     """
 
     plant: OwnPlant
@@ -163,6 +165,7 @@ class Workshop:
     nominal: ArmaxModel
     training: ArmaxModel
     held_out: ArmaxModel
+    corners: ArmaxModel
 
     @property
     def n_steps(self) -> int:
@@ -180,7 +183,7 @@ class Workshop:
     def reference(self, scenarios: Scenarios) -> tuple[Tensor, Tensor]:
         """Mean |e| and movement of the record's PID in each episode, (K,) each."""
         with torch.no_grad():
-            run = track(VelocityPID(self.record), scenarios, self.operation.bounds)
+            run = track(TrackingPID(self.record, self.operation.bounds), scenarios, self.operation.bounds)
         return self.operation.error(run), self.operation.movement(run)
 
 
@@ -201,11 +204,12 @@ def open_workshop(plant: OwnPlant, identified: Identified) -> Workshop:
     members, edge = identified.members, max(1, len(identified.members) * 3 // 4)
     n_models = max(16, plant.epochs(params.policy.models))
     training, held_out = (
-        replace(identified, members=part).ensemble(params.margins, n_models, plant.seed + k).to(dtype)
-        for k, part in enumerate((members[:edge], members[edge:]))
+        replace(identified, members=part).ensemble(params.margins, n_models, plant.seed + k, at_ends).to(dtype)
+        for k, (part, at_ends) in enumerate(((members[:edge], AT_ENDS), (members[edge:], 0.0)))
     )
     whole = operation(clean, description, loops, dtype)
-    workshop = Workshop(plant, whole, record, explained, identified.nominal.to(dtype), training, held_out)
+    others = (identified.nominal.to(dtype), training, held_out, identified.corners(params.margins).to(dtype))
+    workshop = Workshop(plant, whole, record, explained, *others)
     return replace(workshop, training=plausible(workshop, training), held_out=plausible(workshop, held_out))
 
 
@@ -214,7 +218,7 @@ def plausible(workshop: Workshop, models: ArmaxModel) -> ArmaxModel:
     generator = workshop.plant.stream("plausible")
     quiet = draw_scenarios(models, workshop.operation, workshop.plant.params.operation, 3 * workshop.n_steps, generator, quiet=True)
     with torch.no_grad():
-        run = track(VelocityPID(workshop.record), quiet, workshop.operation.bounds)
+        run = track(TrackingPID(workshop.record, workshop.operation.bounds), quiet, workshop.operation.bounds)
     late = (run.error[-workshop.n_steps :].abs() / workshop.operation.unit)[..., list(workshop.operation.loops)].amax((0, 2))
     held = late < HELD
     return models.members(held) if held.double().mean() > FEWEST else models
@@ -263,13 +267,22 @@ def learn_policy(
     return policy, records
 
 
-def pass_gate(workshop: Workshop, candidates: Mapping[str, Tracker]) -> Verdict:
-    """All candidates on models held out, in several episodes of each, twice as long as those of training."""
+def candidates(workshop: Workshop, tuned: Gains, predictive: PredictiveControl, policy: TrackingPolicy) -> dict[str, Tracker]:
+    """The controllers between which the gate decides, by name."""
+    bounds = workshop.operation.bounds
+    pids = {gate.RECORD: TrackingPID(workshop.record, bounds), gate.TUNED: TrackingPID(tuned, bounds)}
+    return pids | {gate.PREDICTIVE: predictive, gate.POLICY: policy}
+
+
+def pass_gate(workshop: Workshop, controllers: Mapping[str, Tracker]) -> gate.Verdict:
+    """All candidates on models held out, in several episodes of each, twice as long as those of training, and in the corners."""
     params, generator = workshop.plant.params, workshop.plant.stream("gate")
     n_models, each = params.gate.models, params.gate.episodes
     noisy = workshop.draw(workshop.held_out, n_models, generator, longer=2, each=each)
     quiet = workshop.draw(workshop.held_out, n_models, generator, longer=2, each=each, quiet=True)
-    return judge(candidates, noisy, quiet, workshop.operation, params.policy.movement, params.gate)
+    all_corners = workshop.corners.members(torch.arange(len(workshop.corners)).repeat_interleave(params.gate.corner_episodes))
+    corners = draw_scenarios(all_corners, workshop.operation, params.operation, workshop.n_steps, generator)
+    return gate.judge(controllers, (noisy, quiet, corners), workshop.operation, params.policy.movement, params.gate)
 
 
 def parameter_table(plant: OwnPlant, identified: Identified) -> pd.DataFrame:

@@ -10,7 +10,7 @@ import torch
 from scipy.stats import ttest_rel
 from torch import Tensor
 
-from helpers.learning.tracking_policy import TrackingPolicy, VelocityPID
+from helpers.learning.tracking_policy import TrackingPID, TrackingPolicy
 from helpers.own_plant.episodes import Stretch
 from helpers.own_plant.identify import Identified, identify
 from helpers.own_plant.learn import Workshop, learn_policy, open_workshop
@@ -94,7 +94,7 @@ def improve_on_plant(workshop: Workshop, identified: Identified, policy: Trackin
     explored = plant_episodes(workshop, process, params.explore, generator)
     with torch.no_grad():
         run = track(Exploring(policy, params.disturbance * operation.bounds.span, generator), explored, operation.bounds)
-        recorded = track(VelocityPID(workshop.record), explored, operation.bounds)
+        recorded = track(TrackingPID(workshop.record, operation.bounds), explored, operation.bounds)
     worse = (operation.error(run) > operation.error(recorded)).double().mean().item()
     pieces = [Stretch(y.double().numpy(), u.double().numpy()) for y, u in zip(run.y[:-1].unbind(1), run.u.unbind(1), strict=True)]
     parts = pieces[: len(pieces) * 3 // 4], pieces[len(pieces) * 3 // 4 :]
@@ -109,7 +109,9 @@ def improve_on_plant(workshop: Workshop, identified: Identified, policy: Trackin
     new, _ = learn_policy(replace(open_workshop(informed, again), record=workshop.record, operation=operation), policy, "online")
     fresh = plant_episodes(workshop, process, params.test, generator)
     with torch.no_grad():
-        runs = [track(tracker, fresh, operation.bounds) for tracker in (VelocityPID(workshop.record), policy, new)]
+        runs = [
+            track(tracker, fresh, operation.bounds) for tracker in (TrackingPID(workshop.record, operation.bounds), policy, new)
+        ]
     reference, old, after = (operation.error(each).double() for each in runs)
     moved = [operation.movement(each).double().mean().item() for each in runs]
     p_value = float(ttest_rel(np.asarray(after / reference), np.asarray(old / reference), alternative="less").pvalue)

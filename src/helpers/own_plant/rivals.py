@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from helpers.learning.tracking_policy import Gains, VelocityPID
+from helpers.learning.tracking_policy import Gains, TrackingPID
 from helpers.own_plant.model import ArmaxModel
 from helpers.own_plant.operation import Operation
 from helpers.own_plant.settings import RivalParams
@@ -85,7 +85,7 @@ def tuned_pid(
     def costs(start: Tensor, logs: Tensor) -> list[float]:
         spread = Gains(*gains(start, logs).repeat_interleave(n_episodes, dim=0).unbind(1))
         with torch.no_grad():
-            run = track(VelocityPID(spread), side_by_side(scenarios, len(logs)), operation.bounds)
+            run = track(TrackingPID(spread, operation.bounds), side_by_side(scenarios, len(logs)), operation.bounds)
         shape = (len(logs), n_episodes)
         value = price(operation.error(run).reshape(shape), operation.movement(run).reshape(shape))
         return list(value.nan_to_num(1e9).clamp(max=1e9).tolist())

@@ -11,7 +11,6 @@ from typing import Annotated, Literal, Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
 from torch import Tensor
 
 from helpers.runs.sources import PROJECT
@@ -19,6 +18,7 @@ from helpers.settings.leaf import Count, Leaf, NotNegative, ParameterError, Posi
 from helpers.settings.paper import BalanceParams, ProcessParams, load
 
 Array = NDArray[np.float64]
+SUBSTEPS = 4  # of the integration, a sample; the error is far below the disturbance
 
 
 class HistoryParams(Record):
@@ -47,7 +47,6 @@ class TankParams(Record):
     concentration: Annotated[Positive, Leaf("mol/L")]
     temperature: Annotated[Positive, Leaf("K")]
     time_unit: Annotated[Literal["s", "min", "h"], Leaf("-")]
-    tolerance: Annotated[Positive, Leaf("-")]
     sensor_noise: Annotated[tuple[NotNegative, ...], Leaf("mol/L, K")]
     history: HistoryParams
 
@@ -79,7 +78,7 @@ class SteadyState:
 
 
 class NonlinearTank:
-    """The two balances, integrated over a sample by scipy, with the disturbance and the noise of Eq. 4.1.3-4.1.4.
+    """The two balances, integrated over a sample, with the disturbance and the noise of Eq. 4.1.3-4.1.4.
 
     A `process.Process` in deviation variables from the steady state. The disturbance enters as a kick at the end of each sample,
     diag(d) x sqrt(dt) w as in the paper; a sensor noise of fixed size comes on top of the relative one.
@@ -93,38 +92,36 @@ class NonlinearTank:
         self.n_states = self.n_outputs = len(self.steady.controlled)
         self.n_inputs = len(self.steady.manipulated)
         self.sampling_time, self.time_unit = params.sampling_time, tank.time_unit
-        self.tolerance = tank.tolerance
         self.disturbance = torch.tensor(params.disturbance, dtype=torch.float64) * params.sampling_time**0.5
         self.relative_noise = torch.tensor(params.observation_noise, dtype=torch.float64)
         self.sensor_noise = torch.tensor(tank.sensor_noise, dtype=torch.float64)
         self.lowest = -torch.tensor(self.steady.controlled)
 
-    def balances(self, state: Array, inputs: Array, feed_temperature: Array | float) -> Array:
-        """dC_A/dt and dT/dt in engineering units, shape (2, K), from states and inputs of that shape.
+    def balances(self, state: Tensor, inputs: Tensor, feed_temperature: Tensor | float) -> Tensor:
+        """dC_A/dt and dT/dt in engineering units, (K, 2), from states and inputs of that shape.
 
         dC_A/dt = (F/V)(C_A0 - C_A) - k(T) C_A and
         dT/dt = (F/V)(T_in - T) - (dH/(rho c_p)) k(T) C_A + (UA/(V rho c_p))(T_E - T), k(T) = k_0 exp(-E/(R T)).
         """
-        (c, temperature), (feed, jacket), groups = state, inputs, self.groups
-        reaction = self.steady.frequency * np.exp(-self.steady.activation / temperature) * c
+        (c, temperature), (feed, jacket), groups = state.unbind(-1), inputs.unbind(-1), self.groups
+        reaction = self.steady.frequency * torch.exp(-self.steady.activation / temperature) * c
         heating = groups.dilution_rate * (feed_temperature - temperature) + groups.heat_exchange * (jacket - temperature)
-        return np.stack([groups.dilution_rate * (feed - c) - reaction, heating - groups.reaction_heat * reaction])
+        return torch.stack([groups.dilution_rate * (feed - c) - reaction, heating - groups.reaction_heat * reaction], dim=-1)
 
     def integrate(self, x: Tensor, u: Tensor, feed_drift: float = 0.0) -> Tensor:
-        """The state one sample later without disturbance, shape (K, 2), deviation variables; the input is held."""
-        start = self.steady.controlled[:, None] + x.double().numpy().T
-        inputs = self.steady.manipulated[:, None] + u.double().numpy().T
-        feed_temperature = self.steady.feed_temperature + feed_drift
-        found = solve_ivp(
-            lambda _, flat: self.balances(flat.reshape(start.shape), inputs, feed_temperature).ravel(),
-            (0.0, self.sampling_time),
-            start.ravel(),
-            t_eval=[self.sampling_time],
-            rtol=self.tolerance,
-            atol=self.tolerance,
-            first_step=self.sampling_time,  # most samples need no second step
-        )
-        return torch.from_numpy((found.y.reshape(start.shape) - self.steady.controlled[:, None]).T)
+        """The state one sample later without disturbance, (K, 2), deviation variables; the input is held.
+
+        The classical method of Runge and Kutta (Hairer et al. 1993, Section II.1), so that torch can differentiate it.
+        """
+        rest = torch.from_numpy(self.steady.controlled)
+        state, inputs = rest + x.double(), torch.from_numpy(self.steady.manipulated) + u.double()
+        feed_temperature, dt = self.steady.feed_temperature + feed_drift, self.sampling_time / SUBSTEPS
+        for _ in range(SUBSTEPS):
+            slopes = [self.balances(state, inputs, feed_temperature)]
+            for part in (0.5, 0.5, 1.0):
+                slopes.append(self.balances(state + part * dt * slopes[-1], inputs, feed_temperature))
+            state = state + dt / 6 * (slopes[0] + 2 * slopes[1] + 2 * slopes[2] + slopes[3])
+        return state - rest
 
     def step(self, x: Tensor, u: Tensor, noise: Tensor, feed_drift: float = 0.0) -> Tensor:
         """The next state, shape (K, 2): integrated, disturbed, and with no concentration below zero."""

@@ -16,12 +16,13 @@ import torch
 from matplotlib.figure import Figure
 
 from helpers.learning.learner import TrainingError
-from helpers.learning.tracking_policy import TrackingPolicy, VelocityPID
+from helpers.learning.tracking_policy import TrackingPolicy
 from helpers.own_plant.deploy import STATIC, DeployedPolicy, disagreement, export, export_c
-from helpers.own_plant.gate import POLICY, PREDICTIVE, RECORD, TUNED
+from helpers.own_plant.gate import POLICY
 from helpers.own_plant.learn import (
     OwnPlant,
     Workshop,
+    candidates,
     identify_plant,
     learn_offline,
     learn_policy,
@@ -34,7 +35,7 @@ from helpers.own_plant.learn import (
 )
 from helpers.own_plant.model import load_plant
 from helpers.own_plant.online import improve_on_plant
-from helpers.plant.tracking import Tracker, track
+from helpers.plant.tracking import track
 from helpers.report.figures import DPI_FILE
 from helpers.report.plant_figures import gate_figure, loops_figure, progress_figure, quality_figure, validation_figure
 from helpers.runs.request import check_place
@@ -130,10 +131,8 @@ def work(path: Path, folder: Path, params_root: Path, scale: str, seed: int) -> 
     workshop = open_workshop(plant, identified)
     tuned, predictive = tune(workshop)
     policy, records = learn_policy(workshop, tuned)
-    candidates: dict[str, Tracker] = {
-        RECORD: VelocityPID(workshop.record), TUNED: VelocityPID(tuned), PREDICTIVE: predictive, POLICY: policy
-    }  # fmt: skip
-    verdict = pass_gate(workshop, candidates)
+    controllers = candidates(workshop, tuned, predictive, policy)
+    verdict = pass_gate(workshop, controllers)
     sentences = [
         verdict.words,
         f"{len(plant.clean.table)} samples, {len(plant.clean.findings)} findings, {found.trajectories.n_trajectories} episodes of "
@@ -146,7 +145,7 @@ def work(path: Path, folder: Path, params_root: Path, scale: str, seed: int) -> 
     if verdict.released:
         if given is not None:
             improvement = improve_on_plant(workshop, identified, policy, given)
-            candidates[POLICY] = policy = improvement.policy
+            controllers[POLICY] = policy = improvement.policy
             sentences.append(improvement.words)
         worst = export_policy(workshop, policy, folder)
         sentences.append(f"policy.onnx agrees with the learned policy to {worst:.1g} of the input range over whole episodes")
@@ -156,7 +155,7 @@ def work(path: Path, folder: Path, params_root: Path, scale: str, seed: int) -> 
     tables = {"Controllers on models held out": verdict.table, "Model": fit.T, **tables, "Data quality": quality}
     figures = {
         "gate": gate_figure(verdict),
-        "loops": loops_figure(workshop, candidates, plant.description),
+        "loops": loops_figure(workshop, controllers, plant.description),
         "learning": progress_figure(records),
         "model": validation_figure(validation, plant.description),
         "quality": quality_figure(plant.clean, plant.description),

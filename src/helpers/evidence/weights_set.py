@@ -5,9 +5,9 @@ model (`learning.model_gradient` says how), not by REINFORCE: which policy is be
 it, and this way costs a tenth. All weights of a batch are learnt side by side, each with parameters of its own.
 """
 
+import math
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import pandas as pd
 import torch
@@ -28,16 +28,16 @@ LSTM = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 LONGEST = 1.0  # of a policy's gradient, cut beyond it
 
 
-def sample(printed: Tensor, n_anywhere: int, n_near: int, generator: torch.Generator) -> tuple[list[str], Tensor]:
-    """Weights of unit norm, (1 + n + m, d), and what each is: printed, anywhere on the sphere, or near the printed ones.
+def sample(printed: Tensor, best: Tensor, n_anywhere: int, n_near: int, generator: torch.Generator) -> tuple[list[str], Tensor]:
+    """Weights of unit norm, (1 + n + 2 m, d), and what each is: printed, anywhere on the sphere, near the printed, near the best.
 
-    Near: a step of random direction from them, whose length is even between zero and theirs.
+    Near: a step of random direction, whose length is even between zero and that of the weights.
     """
-    centre = functional.normalize(printed, dim=0)
-    anywhere, near = (torch.randn(n, len(printed), generator=generator, dtype=printed.dtype) for n in (n_anywhere, n_near))
-    length = torch.rand(n_near, 1, generator=generator, dtype=printed.dtype)
-    kinds = ["printed", *["anywhere"] * n_anywhere, *["near"] * n_near]
-    return kinds, functional.normalize(torch.cat([centre[None], anywhere, centre + length * functional.normalize(near)]))
+    centres = functional.normalize(torch.stack([printed, best])).repeat_interleave(n_near, dim=0)
+    anywhere, near = (torch.randn(n, len(printed), generator=generator, dtype=printed.dtype) for n in (n_anywhere, 2 * n_near))
+    length = torch.rand(2 * n_near, 1, generator=generator, dtype=printed.dtype)
+    kinds = ["printed", *["anywhere"] * n_anywhere, *["near printed"] * n_near, *["near best"] * n_near]
+    return kinds, functional.normalize(torch.cat([printed[None], anywhere, centres + length * functional.normalize(near)]))
 
 
 def linear(x: Tensor, matrices: Tensor, biases: Tensor) -> Tensor:
@@ -110,25 +110,30 @@ def relearnt(study: Study, weights: Tensor, n_steps: int, n_episodes: int) -> Te
 def sampled(search: Search, case: int, watch: Callable[[str], object] = print) -> pd.DataFrame:
     """The sample of a case: case, batch, kind, seconds, gap, and alpha and v of each feature.
 
-    Each batch is learnt from a fresh policy of its own, and each begins with the weights that the paper prints.
+    Each batch is learnt from a fresh policy of its own, begins with the weights that the paper prints, and has some near those
+    whose gap is least so far.
     """
-    printed, size, frames = load_published(search.root)[case].alpha, search.size, []
+    size, frames, least = search.size, list[pd.DataFrame](), math.inf
+    printed = best = torch.tensor(load_published(search.root)[case].alpha, dtype=search.study(case, 0).dtype)
     for batch in range(size.batches):
         study = search.study(case, batch)
-        kinds, weights = sample(torch.tensor(printed, dtype=study.dtype), size.anywhere, size.near, study.stream("sample"))
+        kinds, weights = sample(printed, best, size.anywhere, size.near, study.stream("sample"))
 
         def learn(study: Study = study, weights: Tensor = weights) -> State:
             began, truth = time.process_time(), recorded(study).true_features(study.feature_names)
             v = relearnt(study, weights, size.steps, size.episodes)
-            return {"v": v, "truth": truth, "seconds": time.process_time() - began}
+            return {"v": v, "gap": [feature_gap(of_one, truth) for of_one in v], "seconds": time.process_time() - began}
 
-        found = search.once(learn, study, weights, size)
-        columns: dict[str, Any] = {
-            "gap": [feature_gap(v, found["truth"]) for v in found["v"]],
-            "seconds": found["seconds"] / len(weights),
+        found = search.once(learn, study, weights, size.steps, size.episodes)
+        if min(found["gap"]) < least:
+            least = min(found["gap"])
+            best = weights[found["gap"].index(least)]
+        columns = {
+            f"{kind}:{name}": values[:, index].tolist()
+            for kind, values in (("alpha", weights), ("v", found["v"]))
+            for index, name in enumerate(study.feature_names)
         }
-        for kind, values in (("alpha", weights), ("v", found["v"])):
-            columns |= {f"{kind}:{name}": values[:, index].tolist() for index, name in enumerate(study.feature_names)}
-        frames.append(pd.DataFrame({"case": case, "batch": batch, "kind": kinds, **columns}))
-        watch(f"case {case}, weights {batch + 1} of {size.batches}: least gap {100 * min(columns['gap']):.1f} %")
+        given = {"case": case, "batch": batch, "kind": kinds, "seconds": found["seconds"] / len(weights), "gap": found["gap"]}
+        frames.append(pd.DataFrame(given | columns))
+        watch(f"case {case}, weights {batch + 1} of {size.batches}: least gap {100 * least:.1f} %")
     return pd.concat(frames, ignore_index=True)

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from helpers.evidence import printed_search, weights_set
-from helpers.evidence.printed_search import VARIANT, Search, configured, design
+from helpers.evidence.printed_search import Search, design
 from helpers.plant.rollout import stream
 from helpers.report import search_report
 from helpers.runs.artifacts import load_stage
-from helpers.settings.paper import load, load_published
+from helpers.settings.paper import load_published
 from helpers.settings.search import RangeParams, load_search
 
 
@@ -33,17 +33,6 @@ def test_the_design_is_even_within_its_ends_and_never_the_same_twice(root):
             assert given[0] <= min(values)
             assert max(values) <= given[1]
             assert abs(np.mean(np.log(values) < np.log(given).mean()) - 0.5) < 0.02
-
-
-def test_the_setting_by_hand_is_what_the_file_held(root):
-    """So that the first trial is the variant as it was: but for the size of an epoch, which the scale gives."""
-    params, search = load(root, 1), load_search(root)
-    found = configured(params, search.by_hand.model_dump()).learning
-    before, after = params.learning.variants[VARIANT], found.variants[VARIANT]
-    assert (after.learner, after.weights) == (before.learner, before.weights)
-    assert after.initial_output_scale == params.learning.policy.initial_output_scale
-    for name, value in after.exploration.model_dump().items():
-        assert math.isclose(value, getattr(params.learning.policy, name))
 
 
 def test_a_setting_reaches_learner_and_policy(search):

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from inspect import getsource
 from itertools import product
 from pathlib import Path
 from statistics import median
@@ -132,7 +133,7 @@ class Search:
     @cached_property
     def finished(self) -> Finished:
         """The trials that have ended, of the code and packages as they are now."""
-        return Finished(self.kept, digest([versions(), code_behind(MADE_BY)]))
+        return Finished(self.kept, digest([versions(), code_behind(MADE_BY), getsource(recorded), getsource(trained)]))
 
     def study(self, case: int, seed: int, setting: Setting | None = None) -> Study:
         """A case with the variant `printed`, at a setting or as in learning.yaml."""

@@ -8,6 +8,7 @@ it, and this way costs a tenth. All weights of a batch are learnt side by side, 
 import math
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import pandas as pd
 import torch
@@ -25,6 +26,7 @@ from helpers.settings.paper import load_published
 
 RATE = (1e-2, 5e-4)  # Adam's step size, along half a cosine
 LSTM = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+SOURCE = Path(__file__).read_text(encoding="utf-8")  # a sample of other code is drawn again
 LONGEST = 1.0  # of a policy's gradient, cut beyond it
 
 
@@ -124,7 +126,7 @@ def sampled(search: Search, case: int, watch: Callable[[str], object] = print) -
             v = relearnt(study, weights, size.steps, size.episodes)
             return {"v": v, "gap": [feature_gap(of_one, truth) for of_one in v], "seconds": time.process_time() - began}
 
-        found = search.once(learn, study, weights, size.steps, size.episodes)
+        found = search.once(learn, study, weights, size.steps, size.episodes, SOURCE)
         if min(found["gap"]) < least:
             least = min(found["gap"])
             best = weights[found["gap"].index(least)]

@@ -3,11 +3,18 @@
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, Strict
+from pydantic import AfterValidator, Field, Strict
 
-from helpers.settings.leaf import Count, Leaf, Positive, Record, Share, Text, Vector, read_yaml, validate
+from helpers.settings.leaf import Count, Leaf, Positive, Record, Share, Text, Vector, read_yaml, refusal, validate
 
-Ends = tuple[Positive, Positive]
+
+def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] >= ends[1]:
+        raise refusal("expected the lower end first")
+    return ends
+
+
+Ends = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
 
 
 class RangeParams(Record):

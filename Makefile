@@ -16,7 +16,7 @@ SNAKEMAKE = $(BIN)/python -m snakemake --profile profiles/local --cores $(CORES)
 # Tests of numbers: what another processor may round otherwise.
 NUMERICAL := tests/plant tests/learning tests/evidence tests/own_plant tests/runs/test_study.py
 
-.PHONY: help setup reports evidence smoke test portable lock lab bench torture cluster publish notebooks clean
+.PHONY: help setup reports evidence search smoke test portable lock lab bench torture cluster publish notebooks clean
 
 help:  ## show this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-10s %s\n", $$1, $$2}'
@@ -44,6 +44,10 @@ reports: setup  ## run everything at paper scale and write reports/latest/report
 
 evidence: setup $(VENV)/alternatives  ## twenty seeds of it, the claims, the limits, the trials and the inferred settings; resumable
 	$(SNAKEMAKE) --config seeds=$(SEEDS) scale=$(SCALE) missing=$(MISSING) evidence=1 $(if $(filter smoke,$(SCALE)),reports=results/smoke/report)
+
+search: setup  ## the best settings of the printed algorithms, and a sample of weights; hours, resumable; writes reports/reference/search
+	printf '1\n2\n' | xargs -n 1 -P $(CORES) $(BIN)/python -m helpers search --scale $(SCALE)
+	$(BIN)/python -m helpers search --scale $(SCALE)
 
 smoke: setup  ## the same in seconds, with few epochs; the report goes to results/smoke/report/
 	$(SNAKEMAKE) --config seeds=1 scale=smoke reports=results/smoke/report

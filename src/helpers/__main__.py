@@ -9,6 +9,7 @@ COMMANDS = {
     "run": ("helpers.runs.run", "one notebook, by papermill"),
     "refresh": ("helpers.runs.refresh", "all notebooks at their defaults, and their outputs stored in them"),
     "publish": ("helpers.report.publish", "the last report becomes the committed reference"),
+    "search": ("helpers.report.search_report", "the printed algorithms' best settings, a run of hours that can be stopped"),
     "plant": ("helpers.report.plant_report", "from the historian file of your own plant to a controller"),
 }
 

@@ -35,6 +35,7 @@ from helpers.settings.leaf import InputError, read_yaml
 from helpers.settings.limits import load_limits
 from helpers.settings.one_policy import load_one_policy
 from helpers.settings.paper import load, load_published
+from helpers.settings.search import load_search
 
 CASES = int(os.environ.get("CASES", "60"))
 SLOWEST = 20.0  # seconds of the processor: what takes longer hangs
@@ -170,6 +171,7 @@ def load_everything(root):
     load_claims(root)
     load_limits(root, params[1])
     load_one_policy(root, params[1])
+    load_search(root)
     load_own_plant(root)
     load_tank(root, params[1].process)
     for notebook, case in NOTEBOOKS.items():

@@ -160,7 +160,7 @@ def publish() -> None:
         _copy(path, partial / "notebooks" / name)
     if (first / "inferred_settings").is_dir():
         _copy(first / "inferred_settings", partial / "inferred_settings")
-    for part in ("benchmarks", "inferred_settings", "reliability.md"):  # runs of their own, which stay
+    for part in ("benchmarks", "inferred_settings", "reliability.md", "search"):  # runs of their own, which stay
         if (REFERENCE / part).exists() and not (partial / part).exists():
             _copy(REFERENCE / part, partial / part)
     if REFERENCE.exists():

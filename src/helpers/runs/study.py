@@ -138,7 +138,10 @@ class Study:
 
     def fresh_policy(self) -> LSTMPolicy:
         """An untrained policy."""
-        return LSTMPolicy.initial(self.params.learning.policy, self.task, self.stream("policy"))
+        params, scale = self.params.learning.policy, self.variant_params.initial_output_scale
+        if scale is not None:
+            params = params.model_copy(update={"initial_output_scale": scale})
+        return LSTMPolicy.initial(params, self.task, self.stream("policy"))
 
     def learner(
         self,
@@ -188,7 +191,8 @@ class Study:
             start = initial_weights(variant.weights, len(self.task.set_point), self.dtype)
         policy.reset_exploration(variant.exploration)
         generator = self.stream("offline", self.params.base(self.variant))
-        learner = self.learner(policy, self.scale_params.episodes, n_epochs, variant.learner, generator, features)
+        n_episodes = min(variant.episodes or self.scale_params.episodes, self.scale_params.episodes)
+        learner = self.learner(policy, n_episodes, n_epochs, variant.learner, generator, features)
         return learner, demonstrations.features(learner.features), start, n_iterations
 
     def imitate(

@@ -176,11 +176,17 @@ class WeightParams(Record):
 
 
 class VariantParams(Record):
-    """One variant of Algorithms 1 and 2. Without `exploration` the policy explores as its own parameters say."""
+    """One variant of Algorithms 1 and 2.
+
+    Without `exploration` and `initial_output_scale` the policy is as its own parameters say. An epoch has the scale's episodes, or
+    `episodes` if they are fewer.
+    """
 
     learner: LearnerParams
     weights: WeightParams
     exploration: ExplorationParams | None = None
+    initial_output_scale: Annotated[Positive, Leaf("1/sqrt(cells)")] | None = None
+    episodes: Annotated[Count, Field(gt=1), Leaf("episodes")] | None = None
 
 
 class TrialParams(Record):

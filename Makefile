@@ -1,4 +1,4 @@
-# `make help` lists what can be asked for. The plain commands behind each target stand in README.
+# `make help` lists what can be asked for. The plain commands behind reports and test stand in docs/running.md.
 PYTHON ?= python3
 MISSING ?= 0
 KILLS ?= 100
@@ -70,7 +70,7 @@ lock: setup  ## write pylock.toml from environment.txt: every package of every s
 		--format pylock.toml --output-file pylock.toml
 
 lab: setup  ## open JupyterLab on the notebooks
-	$(BIN)/python -m jupyter lab notebooks
+	$(BIN)/python -m jupyter lab --notebook-dir=. --LabApp.default_url=/lab/tree/notebooks
 
 bench: setup  ## measure speed against the machine's bound and other ways; writes reports/reference/benchmarks
 	$(BIN)/python -m pip install --quiet --constraint environment.txt --editable ".[bench]"

@@ -217,18 +217,17 @@ def test_a_few_episodes_of_the_plant_change_the_policy_only_for_a_better_one(tmp
 
 
 def blocks(language):
-    """The blocks of README's section on one's own plant that are in this language."""
-    section = (PROJECT / "README.md").read_text(encoding="utf-8").split("## Your own plant")[1].split("\n## ")[0]
-    return re.findall(rf"```{language}\n(.*?)```", section, re.DOTALL)
+    """The blocks of the page on one's own plant that are in this language."""
+    return re.findall(rf"```{language}\n(.*?)```", (PROJECT / "docs/your_own_plant.md").read_text(encoding="utf-8"), re.DOTALL)
 
 
-def test_readme_s_description_is_one(tmp_path):
+def test_the_description_of_the_docs_is_one(tmp_path):
     (yaml,) = blocks("yaml")
     (tmp_path / "plant.yaml").write_text(yaml, encoding="utf-8")
     assert load_description(tmp_path / "plant.yaml").columns == ("TIME", "MODE", "TC1.PV", "TC1.OP", "TC1.SP")
 
 
-def test_readme_s_command_and_loop_run_as_they_stand(tmp_path, quick_root, monkeypatch):
+def test_the_command_and_the_loop_of_the_docs_run_as_they_stand(tmp_path, quick_root, monkeypatch):
     (shell,), (python,) = blocks("sh"), blocks("python")
     words = shlex.split(shell, comments=True)
     assert words[:4] == [".venv/bin/python", "-m", "helpers", "plant"]

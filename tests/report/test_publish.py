@@ -11,7 +11,14 @@ from helpers.report.publish import PublishError, check
 from helpers.runs.sources import PROJECT
 
 REVISION = "0123abcd" * 5
-GOOD = {"scale": "paper", "revision": REVISION, "revisions_of_stages": [REVISION], "seeds": [0, 1], "missing_seeds": []}
+GOOD = {
+    "scale": "paper",
+    "revision": REVISION,
+    "revisions_of_stages": [REVISION],
+    "seeds": [0, 1],
+    "missing_seeds": [],
+    "stage_seconds": 7200,
+}
 OTHER = "f" * 40
 
 
@@ -50,9 +57,10 @@ def test_other_runs_are_refused_in_one_sentence(changes, reference, revision, sa
 # The command ---------------------------------------------------------------------------------------------------------
 
 README = (
-    "# Title\n<!-- glance: a -->\nold\n<!-- /glance -->\nmiddle\n"
-    "<!-- limits: c -->\n<!-- /limits -->\n<!-- time: b -->\n<!-- /time -->\nend\n"
+    "# Title\n<!-- glance: a -->\nold\n<!-- /glance -->\nmiddle\n<!-- cost: d -->\n<!-- /cost -->\n"
+    "<!-- limits: c -->\n<!-- /limits -->\nend\n"
 )
+RUNNING = "# Running it\n<!-- time: b -->\n<!-- /time -->\nend\n"
 
 
 GAPS = """\
@@ -84,6 +92,7 @@ def project(monkeypatch, tmp_path):
         results / "paper/seed_0/case_3/notebooks/.01_demonstrations.123.ipynb": "what a killed run left",
         results / "paper/seed_1/case_3/notebooks/01_demonstrations.ipynb": "01 of another seed",
         tmp_path / "README.md": README,
+        tmp_path / "docs/running.md": RUNNING,
     }
     for path, text in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -120,7 +129,9 @@ def test_publishing_writes_the_numbers_into_readme(project):
     assert rows[0] == ["I", "1.0 % [0.9, 1.2]", "10.0 %", "20.0 % [15.0, 31.0]", "40.0 %", "95.1 %"]
     assert rows[1] == ["II", "2.0 %", "13.7 %", "3.0 % [2.0, 4.0]", "–", "–"]
     assert "(ours: medians and 95 % bootstrap intervals of the median over 20 seeds)" in lines
-    assert any("offline_improved" in line and " 20 " in line for line in lines)
+    assert "its 2 seeds took 2 hours. With two cores, two stages run at a time." in lines
+    running = (project / "docs/running.md").read_text(encoding="utf-8").splitlines()
+    assert any("offline_improved" in line and " 20 " in line for line in running)
     kept = [line for line in lines if line in README.splitlines()]
     assert kept == README.replace("old\n", "").splitlines()
 

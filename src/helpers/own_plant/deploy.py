@@ -114,6 +114,17 @@ def export(
     names = memory_names(policy)
     memory = [entry.double() if place < 3 else entry.float() for place, entry in enumerate(policy.start(1))]
     example = (steady_y.double()[None], steady_y.double()[None], steady_u.double()[None], *memory)
+    return write(module, example, names, path, notes, static)
+
+
+def write(
+    module: nn.Module, example: tuple[Tensor, ...], names: list[str], path: Path, notes: dict[str, Any], static: bool = False
+) -> Path:
+    """`export` of a module that maps (y, set_point, u_previous, memory..), as in the example, to (u, memory..).
+
+    Args:
+        names: of the memory.
+    """
     outputs = ["u", *(f"{name}_next" for name in names)]
     axes = {name: {0: "K"} for name in ("y", "set_point", "u_previous", *names, *outputs)}
     with warnings.catch_warnings():

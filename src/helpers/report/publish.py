@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 
 from helpers.report.limits_figures import LABELS, LEARNERS
+from helpers.report.policies import write_policies
 from helpers.report.tables import ROMAN, spread
 from helpers.runs.artifacts import code_revision
 from helpers.runs.sources import PROJECT
@@ -103,8 +104,26 @@ def fill(text: str, block: str, content: str) -> str:
     mark, closed, old_and_tail = rest.partition("-->\n")
     _, ended, tail = old_and_tail.partition(f"<!-- /{block} -->")
     if not (found and closed and ended):
-        raise PublishError(f"README.md: the marks of the block '{block}' are missing")
+        raise PublishError(f"README.md and docs: the marks of the block '{block}' are missing")
     return f"{head}{found}{mark}{closed}{content}\n{ended}{tail}"
+
+
+def filled(paths: Iterable[Path], blocks: Mapping[str, str]) -> dict[Path, str]:
+    """The pages, each block filled where its marks stand."""
+    pages = {path: path.read_text(encoding="utf-8") for path in paths}
+    for block, content in blocks.items():
+        path = next((path for path, text in pages.items() if f"<!-- {block}:" in text), next(iter(pages)))
+        pages[path] = fill(pages[path], block, content)
+    return pages
+
+
+def cost(time: pd.DataFrame, provenance: Mapping[str, Any]) -> str:
+    """README's sentence on what the run has cost, from tables/time.csv and its provenance."""
+    minutes, hours = time["seconds"].sum() / 60, provenance["stage_seconds"] / 3600
+    return (
+        f"On the machine of the published run, the stages of one seed took {minutes:.1f} minutes of computing, and all stages of\n"
+        f"its {len(provenance['seeds'])} seeds took {hours:.0f} hours. With two cores, two stages run at a time."
+    )
 
 
 def check_copies(copies: Iterable[Path]) -> None:
@@ -136,7 +155,7 @@ def executed_copies(first: Path) -> dict[str, Path]:
 
 
 def publish() -> None:
-    """Check the last run, put it in the place of the reference and its numbers into README.
+    """Check the last run, put it in the place of the reference and its numbers into README and docs.
 
     Raises:
         PublishError, OSError: if the run may not be published, or cannot be.
@@ -148,11 +167,11 @@ def publish() -> None:
     first = RESULTS / latest["scale"] / f"seed_{latest['seeds'][0]}"
     copies = executed_copies(first)
     check_copies(copies.values())
-    readme = PROJECT / "README.md"
-    text = fill(readme.read_text(encoding="utf-8"), "glance", glance(pd.read_csv(LATEST / "tables/gaps.csv")))
+    time = pd.read_csv(LATEST / "tables/time.csv")
+    blocks = {"glance": glance(pd.read_csv(LATEST / "tables/gaps.csv")), "cost": cost(time, latest), "time": time_by_stage(time)}
     if (LATEST / LIMITS).exists():
-        text = fill(text, "limits", limits_at_a_glance(pd.read_csv(LATEST / LIMITS)))
-    text = fill(text, "time", time_by_stage(pd.read_csv(LATEST / "tables/time.csv")))
+        blocks["limits"] = limits_at_a_glance(pd.read_csv(LATEST / LIMITS))
+    pages = filled([PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))], blocks)
     partial, old = _beside("partial"), _beside("old")
     for part in PARTS:
         _copy(LATEST / part, partial / part)
@@ -160,13 +179,15 @@ def publish() -> None:
         _copy(path, partial / "notebooks" / name)
     if (first / "inferred_settings").is_dir():
         _copy(first / "inferred_settings", partial / "inferred_settings")
+    write_policies(first, partial / "policies")
     for part in ("benchmarks", "inferred_settings", "reliability.md", "search"):  # runs of their own, which stay
         if (REFERENCE / part).exists() and not (partial / part).exists():
             _copy(REFERENCE / part, partial / part)
     if REFERENCE.exists():
         REFERENCE.rename(old)
     partial.rename(REFERENCE)
-    readme.write_text(text, encoding="utf-8")
+    for path, text in pages.items():
+        path.write_text(text, encoding="utf-8")
 
 
 def _beside(word: str) -> Path:

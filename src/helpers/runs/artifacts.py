@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
+from torch import nn
 
 from helpers.learning.policy import LSTMPolicy
 from helpers.plant.task import ControlTask, Trajectories
@@ -87,7 +88,7 @@ def save_stage(
     folder: Path,
     record: Mapping[str, Any],
     tables: Mapping[str, pd.DataFrame] | None = None,
-    policy: LSTMPolicy | None = None,
+    policy: nn.Module | None = None,
     figures: Mapping[str, Figure] | None = None,
 ) -> Stage:
     """Write a stage's results into `folder`, all of them or none, and return what was written.

@@ -1,0 +1,121 @@
+"""The policies to take along: each reaches the J on its card, and its ONNX file and C source act as it does."""
+
+import ast
+import ctypes
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from helpers.learning.evaluation import objective
+from helpers.learning.tracking_policy import Gains, TrackingPolicy
+from helpers.own_plant.deploy import DeployedPolicy
+from helpers.plant.tracking import AtSetPoint, Bounds
+from helpers.report.policies import collect, write_policies
+from helpers.runs import policies
+from helpers.runs.artifacts import ArtifactError, save_stage
+from helpers.runs.policies import FOLDER, load_policy
+from helpers.runs.sources import PROJECT
+
+SMOKE = PROJECT / "notebooks/inputs/smoke/seed_0"
+PUBLISHED = sorted(path.stem for path in FOLDER.glob("*.safetensors"))
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory, study):
+    """The policies of Case III of the committed smoke run, and a made-up one for all cases."""
+    first, folder = tmp_path_factory.mktemp("first"), tmp_path_factory.mktemp("policies")
+    shutil.copytree(SMOKE / "case_3", first / "case_3")  # C source takes its time: one case will do
+    cases = {case: replace(study(case), case=case) for case in (1, 2, 3)}
+    target, task = torch.stack([found.task.set_point for found in cases.values()]), cases[1].task
+    gains = Gains(*(size * torch.eye(2, dtype=torch.float64) for size in (5.0, 3.0, 0.0)))
+    middle, reach = (target.amax(0) + target.amin(0)) / 2, (target.amax(0) - target.amin(0)) / 2
+    torch.manual_seed(0)
+    policy = TrackingPolicy(
+        cases[1].params.learning.policy, gains, task.set_point.abs(), middle, reach, Bounds(task.input_low, task.input_high, reach)
+    )
+    torch.nn.init.normal_(policy.output.weight, std=0.1)
+    rows = []
+    for case, found in cases.items():
+        controllers = {
+            "one_policy": AtSetPoint(policy, found.task),
+            "expert": found.expert,
+            "minimum_variance": found.minimum_variance,
+        }
+        for name, controller in controllers.items():
+            value = objective(found.fresh(controller), found.features.on("x"), 30.0).mean().item()
+            rows.append(("case", case, name, value))
+    table = pd.DataFrame(rows, columns=["group", "case", "controller", "objective"])
+    record = {"notebook": "09_one_policy", "seed": 0, "scale": "smoke", "revision": "0"}
+    save_stage(first / "case_1/one_policy", record, {"judged.csv": table}, policy)
+    write_policies(first, folder)
+    return folder
+
+
+def test_every_case_gives_its_offline_and_its_online_policy(root):
+    found = [name for name, *_ in collect(SMOKE, root)]
+    assert found == [f"case_{case}_{kind}" for case in (1, 2, 3) for kind in ("offline", "online")]
+
+
+def holds(name, folder):
+    """The score of a policy is that of its card, and its ONNX file asks for the same inputs along the same episodes."""
+    trained, file = load_policy(name, folder), DeployedPolicy(folder / f"{name}.onnx")
+    assert trained.card == file.notes
+    for case, scores in trained.card["scores"].items():
+        study = trained.study(int(case))
+        run = study.fresh(trained.controller(study))
+        assert study.judge(run)["objective_x"] == pytest.approx(scores["the policy"], rel=1e-3)
+        assert study.judge(study.fresh(study.expert))["objective_x"] == pytest.approx(scores["the PID"], rel=1e-3)
+        before, span = np.zeros(run.u.shape[1:]), (study.task.input_high - study.task.input_low).double().numpy()
+        file.reset(run.n_trajectories)
+        aim = study.task.set_point.expand_as(run.y[0]).double().numpy()
+        for y, u in zip(run.y[:-1].double().numpy(), run.u.double().numpy(), strict=True):
+            assert np.abs((file.step(y, aim, before) - u) / span).max() < 1e-4
+            before = u
+
+
+@pytest.mark.parametrize("name", ["case_3_offline", "case_3_online", "one_policy"])
+def test_a_written_policy_holds_its_score(written, name):
+    holds(name, written)
+    card = (written / f"{name}.md").read_text(encoding="utf-8")
+    assert all(f"**{word}:**" in card for word in ("Trained on", "For set points", "Measured", "Not for"))
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_a_published_policy_holds_its_score(name):
+    holds(name, FOLDER)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+@pytest.mark.parametrize("name", ["case_3_online", "one_policy"])
+def test_the_c_source_acts_as_the_file(written, tmp_path, name):
+    library = tmp_path / "policy.so"
+    subprocess.run(["cc", "-O1", "-shared", "-fPIC", written / f"{name}.c", "-o", library, "-lm"], check=True)
+    function, file = ctypes.CDLL(str(library)).policy, DeployedPolicy(written / f"{name}.onnx")
+    y, aim, u, memory = np.array([[0.3, -0.5]]), np.array([[-1.0, 4.0]]), np.zeros((1, 2)), file.memory
+    for _ in range(20):
+        after, applied = [np.empty_like(entry) for entry in memory], np.empty_like(u)
+        function(*(ctypes.c_void_p(array.ctypes.data) for array in (y, aim, u, *memory, applied, *after)))
+        assert applied == pytest.approx(file.step(y, aim, u), abs=1e-4)
+        y, u, memory = y + 0.1 * (aim - y), applied, after
+
+
+def test_the_five_lines_of_the_docs_run_as_they_stand(written, monkeypatch, capsys):
+    (python,) = re.findall(r"```python\n(.*?)```", (PROJECT / "docs/policies.md").read_text(encoding="utf-8"), re.DOTALL)
+    monkeypatch.setattr(policies, "FOLDER", written)
+    exec(python, {})
+    reached, rest = capsys.readouterr().out.split(" ", 1)
+    assert float(reached) == pytest.approx(ast.literal_eval(rest)["3"]["the policy"])
+
+
+def test_what_is_no_policy_is_refused_in_one_sentence(written, tmp_path):
+    with pytest.raises(ArtifactError, match=r"no such policy; the policies are: case_3_offline, case_3_online, one_policy"):
+        load_policy("case_9", written)
+    (tmp_path / "text.safetensors").write_text("no policy")
+    with pytest.raises(ArtifactError, match=r"text\.safetensors: not a policy of this project"):
+        load_policy("text", tmp_path)

@@ -70,7 +70,7 @@ lock: setup  ## write pylock.toml from environment.txt: every package of every s
 		--format pylock.toml --output-file pylock.toml
 
 lab: setup  ## open JupyterLab on the notebooks
-	$(BIN)/python -m jupyter lab --notebook-dir=. --LabApp.default_url=/lab/tree/notebooks
+	$(BIN)/python -m jupyter lab notebooks
 
 bench: setup  ## measure speed against the machine's bound and other ways; writes reports/reference/benchmarks
 	$(BIN)/python -m pip install --quiet --constraint environment.txt --editable ".[bench]"

@@ -3,11 +3,10 @@
 import copy
 import json
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import torch
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
@@ -18,28 +17,27 @@ from helpers.learning.tracking_policy import TrackingPolicy
 from helpers.own_plant.deploy import export, export_c, write
 from helpers.plant.task import ControlTask
 from helpers.report.tables import ROMAN
-from helpers.runs.artifacts import RECORD, Stage, load_stage
-from helpers.runs.policies import load_policy
+from helpers.runs.artifacts import RECORD, load_stage
+from helpers.runs.policies import TrainedPolicy, rebuilt
 from helpers.runs.sources import PROJECT
 from helpers.settings.paper import HEADLINE, Params, load, load_published
 
-Scores = dict[int, dict[str, float]]  # J by case and controller
-ONE, STATE = "one_policy", "policy.safetensors"
+ONE = "one_policy"
 TRAINED_ON = {
-    "offline": "The records of the PID and the model of the process, by Algorithms 1 and 2 in our variant; not on the plant",
-    "online": "The offline policy of its case and simulated episodes of the plant, for the tracking objective",
-    ONE: "The model of the process, by the gradient through it, for set points drawn from the range below; not on the plant",
+    "offline": "the records of the PID and the model of the process, by Algorithms 1 and 2 in our variant; not on the plant",
+    "online": "the offline policy of its case and simulated episodes of the plant, for the tracking objective",
+    ONE: "the model of the process, by the gradient through it, for set points drawn from the range below; not on the plant",
 }
 CARD = """\
 # {name}
 
-{title}.
+{title}
 
-- **Trained on:** {trained_on}. By `notebooks/{notebook}.ipynb`, seed {seed}, scale `{scale}`, at commit {revision}.
-- **For set points:** {set_points}. **Inputs:** {inputs}. **Sampling time:** {sampling_time:g}. These are deviation variables, for
-  which the paper prints no units.
-- **Measured:** J of Eq. 5.1.2.1 with beta = {beta:g} on the true state, mean over fresh simulated episodes. {scores}.
-- **Not for:** Other set points, bounds or sampling times, another process, or a real plant, which it has never met.
+- **Trained on** {trained_on} (`notebooks/{notebook}.ipynb`, seed {seed}, scale `{scale}`, commit {revision}).
+- **For set points** {set_points}; **inputs** {inputs}; **sampling time** {sampling_time:g}; deviation variables, for which the
+  paper prints no units.
+- **Measured** by J of Eq. 5.1.2.1 with beta = {beta:g} on the true state, mean over {episodes} fresh simulated episodes: {scores}.
+- **Not for** other set points, bounds or sampling times, another process, or a real plant, which it has never met.
 
 `helpers.runs.policies.load_policy("{name}")` reads `{name}.safetensors`. `{name}.onnx` and `{name}.c` compute one sample: from the
 measurement, the set point, the input applied last and the memory, which is zero at first, to the input to apply and the memory.
@@ -53,12 +51,8 @@ class ModeStep(nn.Module):
         super().__init__()
         self.policy = copy.deepcopy(policy).float()
         self.low, self.span = task.input_low.double(), (task.input_high - task.input_low).double()
-
-    @property
-    def memory(self) -> dict[str, Tensor]:
-        """Zeros for h and c of each layer, by name."""
-        sizes = [layer.hidden_size for layer in self.policy.lstms]
-        return {f"{kind}_{index}": torch.zeros(1, size) for index, size in enumerate(sizes) for kind in "hc"}
+        sizes = [layer.hidden_size for layer in policy.lstms]
+        self.memory = {f"{kind}_{index}": torch.zeros(1, size) for index, size in enumerate(sizes) for kind in "hc"}
 
     def forward(self, y: Tensor, set_point: Tensor, u_previous: Tensor, *memory: Tensor) -> tuple[Tensor, ...]:
         """The input to apply, (K, n_u), and the memory for the next sample."""
@@ -75,18 +69,65 @@ class ModeStep(nn.Module):
 
 def write_policies(first: Path, folder: Path, params_root: Path = PROJECT / "params") -> None:
     """Write every policy that the results of a seed in `first` hold, as safetensors, ONNX and C, and its card."""
-    for name, kind, stage, params, scores in collect(first, params_root):
-        state = load_file(stage.path(STATE))
-        card = _card(kind, stage, params, scores, state)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{name}.safetensors").write_bytes(save(state, {"card": json.dumps(card)}))
-        trained = load_policy(name, folder)
-        task = trained.study(params_root=params_root).task
-        _write_onnx(trained.policy, task, folder / f"{name}.onnx", card)
-        with tempfile.TemporaryDirectory() as scratch:
-            static = _write_onnx(trained.policy, task, Path(scratch) / "static.onnx", {}, static=True)
-            export_c(static, folder / f"{name}.c")
-        (folder / f"{name}.md").write_text(_shown(name, card), encoding="utf-8")
+    cases = {case: load(params_root, case) for case in load_published(params_root)}
+    places = {ONE: (ONE, list(cases), f"case_1/{ONE}")}
+    for case, params in cases.items():
+        offline = "offline" if params.case.offline.transfer_from is None else "transfer"
+        for kind, stage in (("offline", offline), ("online", "online")):
+            places[f"case_{case}_{kind}"] = (kind, [case], f"case_{case}/{stage}_{HEADLINE}")
+    for name, (kind, of_cases, place) in places.items():
+        if (first / place / RECORD).is_file():
+            found = load_stage(first / place, "make evidence")
+            state, params = load_file(found.path("policy.safetensors")), cases[of_cases[0]]
+            card = _card(kind, found.record, params, state) | {"cases": of_cases}
+            trained = TrainedPolicy(rebuilt(params.learning.policy, state), card)
+            card["scores"] = {str(case): _scores(trained, case, params_root) for case in of_cases}
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / f"{name}.safetensors").write_bytes(save(state, {"card": json.dumps(card)}))
+            (folder / f"{name}.md").write_text(_shown(name, card), encoding="utf-8")
+            task = trained.study(params_root=params_root).task
+            _write_onnx(trained.policy, task, folder / f"{name}.onnx", card)
+            with tempfile.TemporaryDirectory() as scratch:
+                export_c(_write_onnx(trained.policy, task, Path(scratch) / "static.onnx", {}, static=True), folder / f"{name}.c")
+
+
+def _scores(trained: TrainedPolicy, case: int, params_root: Path) -> dict[str, float]:
+    """J of the policy and of its rivals on the episodes on which the published run has judged them."""
+    study = trained.study(case, params_root)
+    controllers = {"policy": trained.policy, "PID": study.expert, "minimum variance": study.minimum_variance}
+    return {name: study.judge(study.fresh(controller))["objective_x"] for name, controller in controllers.items()}
+
+
+def _card(kind: str, record: Mapping[str, Any], params: Params, state: Mapping[str, Tensor]) -> dict[str, Any]:
+    """What a policy file tells about itself, but for its scores."""
+    process, target = params.process, torch.tensor(params.case.set_point)
+    low, high = (state.get("centre", target) + sign * state.get("reach", 0 * target) for sign in (-1, 1))
+    return {
+        "title": "One policy for all case studies." if kind == ONE else f"{params.case.title}; after {kind} learning.",
+        "trained_on": TRAINED_ON[kind],
+        **{key: record[key] for key in ("notebook", "seed", "scale", "revision")},
+        "set_point_range": dict(zip(process.controlled, torch.stack([low, high], dim=1).tolist(), strict=True)),
+        "input_range": {
+            name: list(ends) for name, *ends in zip(process.manipulated, process.input_low, process.input_high, strict=True)
+        },
+        "sampling_time": process.sampling_time,
+        "beta": params.case.online.headline_beta,
+        "episodes": params.learning.scales[record["scale"]].evaluation,
+        "policy": params.learning.policy.model_dump(mode="json"),
+    }
+
+
+def _shown(name: str, card: Mapping[str, Any]) -> str:
+    """The card as Markdown."""
+    words = {
+        key: ", ".join(f"{variable} {low:g}" + (f" to {high:g}" if high > low else "") for variable, (low, high) in found.items())
+        for key, found in (("set_points", card["set_point_range"]), ("inputs", card["input_range"]))
+    }
+    words["scores"] = "; ".join(
+        f"Case {ROMAN[int(case) - 1]}, " + ", ".join(f"{who} {value:.2f}" for who, value in found.items())
+        for case, found in card["scores"].items()
+    )
+    return CARD.format(**dict(card) | words, name=name)
 
 
 def _write_onnx(
@@ -97,59 +138,3 @@ def _write_onnx(
         return export(policy, y[0], u[0], path, card, static)
     step = ModeStep(policy, task)
     return write(step, (y, y, u, *step.memory.values()), list(step.memory), path, card, static)
-
-
-def collect(first: Path, params_root: Path) -> Iterator[tuple[str, str, Stage, Params, Scores]]:
-    """Name, kind, stage and parameters of every policy, and J of it and its rivals a case."""
-    cases = {case: load(params_root, case) for case in load_published(params_root)}
-    for case, params in cases.items():
-        names = {"offline": "offline" if params.case.offline.transfer_from is None else "transfer", "online": "online"}
-        places = {kind: first / f"case_{case}/{name}_{HEADLINE}" for kind, name in names.items()}
-        if all((place / RECORD).is_file() for place in places.values()):
-            stages = {kind: load_stage(place, "make reports") for kind, place in places.items()}
-            rows = pd.concat([stage.table("scores.csv") for stage in stages.values()])
-            found = rows[rows["metric"] == "objective_x"].set_index("stage")["value"]
-            for kind, stage in stages.items():
-                yield f"case_{case}_{kind}", kind, stage, params, {case: _scores(found, kind, "expert_paired")}
-    place = first / "case_1" / ONE
-    if (place / RECORD).is_file():
-        stage = load_stage(place, "make evidence")
-        rows = stage.table("judged.csv").query("group == 'case'")
-        judged = {case: part.set_index("controller")["objective"] for case, part in rows.groupby("case")}
-        yield ONE, ONE, stage, cases[1], {case: _scores(found, ONE, "expert") for case, found in judged.items()}
-
-
-def _scores(found: pd.Series, policy: str, expert: str) -> dict[str, float]:
-    names = {"the policy": policy, "the PID": expert, "minimum variance": "minimum_variance"}
-    return {name: float(found[row]) for name, row in names.items()}
-
-
-def _card(kind: str, stage: Stage, params: Params, scores: Scores, state: Mapping[str, Tensor]) -> dict[str, Any]:
-    """What a policy file tells about itself."""
-    process, target = params.process, torch.tensor(params.case.set_point)
-    low, high = (state.get("centre", target) + sign * state.get("reach", 0 * target) for sign in (-1, 1))
-    return {
-        "title": "One policy for all case studies" if kind == ONE else f"{params.case.title}; after {kind} learning",
-        "trained_on": TRAINED_ON[kind],
-        **{key: stage.record[key] for key in ("notebook", "seed", "scale", "revision")},
-        "set_point_range": dict(zip(process.controlled, zip(low.tolist(), high.tolist(), strict=True), strict=True)),
-        "input_range": dict(zip(process.manipulated, zip(process.input_low, process.input_high, strict=True), strict=True)),
-        "sampling_time": process.sampling_time,
-        "beta": params.case.online.headline_beta,
-        "scores": scores,
-        "policy": params.learning.policy.model_dump(),
-    }
-
-
-def _shown(name: str, card: Mapping[str, Any]) -> str:
-    """The card as Markdown."""
-
-    def ranges(found: Mapping[str, tuple[float, float]]) -> str:
-        return ", ".join(f"{key} {low:g}" + (f" to {high:g}" if high > low else "") for key, (low, high) in found.items())
-
-    scores = "; ".join(
-        f"Case {ROMAN[case - 1]}: {', '.join(f'{value:.2f} for {who}' for who, value in found.items())}"
-        for case, found in card["scores"].items()
-    )
-    words = {"set_points": ranges(card["set_point_range"]), "inputs": ranges(card["input_range"]), "scores": scores}
-    return CARD.format(**dict(card) | words, name=name)

@@ -11,10 +11,9 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from helpers.learning.policy import LSTMPolicy, PolicyController
+from helpers.learning.policy import LSTMPolicy
 from helpers.learning.tracking_policy import Gains, TrackingPolicy
-from helpers.plant.controllers import Controller
-from helpers.plant.tracking import AtSetPoint, Bounds
+from helpers.plant.tracking import Bounds
 from helpers.runs.artifacts import ArtifactError
 from helpers.runs.sources import PROJECT
 from helpers.runs.study import Study
@@ -32,16 +31,10 @@ class TrainedPolicy:
 
     def study(self, case: int | None = None, params_root: Path = PROJECT / "params") -> Study:
         """The simulated plant of a case that the policy was trained for, the first of them unless given."""
-        case = case or min(map(int, self.card["scores"]))
+        case = case or self.card["cases"][0]
         params = load(params_root, case)
         scale = params.learning.scales[self.card["scale"]]
         return Study(params=params, scale_params=scale, seed=self.card["seed"], case=case)
-
-    def controller(self, study: Study) -> Controller:
-        """The policy as it runs on that plant: its mode, at the set point of the study."""
-        if isinstance(self.policy, LSTMPolicy):
-            return PolicyController(self.policy, study.task, exploring=False)
-        return AtSetPoint(self.policy, study.task)
 
 
 def load_policy(name: str, folder: Path | None = None) -> TrainedPolicy:

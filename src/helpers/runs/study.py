@@ -17,10 +17,12 @@ from helpers.learning.evaluation import feature_gap, relative_gap, scores
 from helpers.learning.features import FeatureMap, feature_names
 from helpers.learning.learner import EpochRecord, Learner
 from helpers.learning.policy import LSTMPolicy, PolicyController
+from helpers.learning.tracking_policy import TrackingPolicy
 from helpers.plant.controllers import PID, Controller, MinimumVariance
 from helpers.plant.process import LinearProcess
 from helpers.plant.rollout import rollout, stream
 from helpers.plant.task import ControlTask, Trajectories
+from helpers.plant.tracking import AtSetPoint
 from helpers.runs.finished import State
 from helpers.runs.progress import ProgressBar
 from helpers.settings.paper import HEADLINE, LearnerParams, Params, PublishedCase, ScaleParams, VariantParams
@@ -231,13 +233,15 @@ class Study:
 
     # Judging -----------------------------------------------------------------------------------------------------------
 
-    def deploy(self, policy: LSTMPolicy) -> PolicyController:
-        """The policy as it would run on the plant: its mode."""
+    def deploy(self, policy: LSTMPolicy | TrackingPolicy) -> Controller:
+        """The policy as it would run on the plant: its mode, at the set point of the task."""
+        if isinstance(policy, TrackingPolicy):
+            return AtSetPoint(policy, self.task)
         return PolicyController(policy, self.task, exploring=False)
 
-    def fresh(self, controller: Controller | LSTMPolicy, n_trajectories: int | None = None) -> Trajectories:
-        """Trajectories that no learning has seen; the same disturbances for every controller. A policy acts by its mode."""
-        if isinstance(controller, LSTMPolicy):
+    def fresh(self, controller: Controller | LSTMPolicy | TrackingPolicy, n_trajectories: int | None = None) -> Trajectories:
+        """Trajectories that no learning has seen; the same disturbances for every controller. A policy is deployed."""
+        if isinstance(controller, LSTMPolicy | TrackingPolicy):
             controller = self.deploy(controller)
         number = n_trajectories or self.scale_params.evaluation
         return rollout(self.process, controller, self.task, number, self.stream("evaluation"))

@@ -98,22 +98,16 @@ def limits_at_a_glance(gaps: pd.DataFrame) -> str:
     return str(shown.to_markdown(index=False, disable_numparse=True))
 
 
-def fill(text: str, block: str, content: str) -> str:
-    """The text with `content` between the marks of a block."""
-    head, found, rest = text.partition(f"<!-- {block}:")
-    mark, closed, old_and_tail = rest.partition("-->\n")
-    _, ended, tail = old_and_tail.partition(f"<!-- /{block} -->")
-    if not (found and closed and ended):
-        raise PublishError(f"README.md and docs: the marks of the block '{block}' are missing")
-    return f"{head}{found}{mark}{closed}{content}\n{ended}{tail}"
-
-
 def filled(paths: Iterable[Path], blocks: Mapping[str, str]) -> dict[Path, str]:
-    """The pages, each block filled where its marks stand."""
+    """The pages, with the content of each block between its marks, wherever they stand."""
     pages = {path: path.read_text(encoding="utf-8") for path in paths}
     for block, content in blocks.items():
-        path = next((path for path, text in pages.items() if f"<!-- {block}:" in text), next(iter(pages)))
-        pages[path] = fill(pages[path], block, content)
+        between = re.compile(rf"(<!-- {block}:[^>]*-->\n).*?(?=<!-- /{block} -->)", re.DOTALL)
+        found = [path for path, text in pages.items() if between.search(text)]
+        if len(found) != 1:
+            raise PublishError(f"README.md and docs: the marks of the block '{block}' must stand on one page, not on {len(found)}")
+        head, mark, tail = between.split(pages[found[0]])
+        pages[found[0]] = f"{head}{mark}{content}\n{tail}"
     return pages
 
 

@@ -1,12 +1,12 @@
 """Trainings that need not be repeated: what each one of a run gave is kept on disk until the run's results are written.
 
-A state is a nested structure of dictionaries, lists, numbers, texts and tensors. The tensors go into a safetensors file and the
-rest into its header as JSON, so that nothing that is read executes code. A file belongs to one training: its name and header hold
-a hash of all that the training starts from. That of another training, or of other code, is never read.
+A state is a nested structure of dictionaries, lists, numbers, texts and tensors; torch reads it back without executing code. A file
+belongs to one training: its name and content hold a hash of all that the training starts from. That of another training, or of
+other code, is never taken for it.
 """
 
 import hashlib
-import json
+import io
 import shutil
 import warnings
 from collections.abc import Callable
@@ -15,14 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+import torch
 from torch import Tensor
 
 from helpers.runs.scratch import beside, sweep
 
 State = dict[str, Any]
-TENSOR = "tensor"  # marks, in the JSON, the place of a tensor: {"tensor": its name}
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ class Finished:
         for part in start:
             content.update(part.detach().numpy().tobytes() if isinstance(part, Tensor) else repr(part).encode())
         training = content.hexdigest()
-        path = self.folder / f"{training[:16]}.safetensors"
+        path = self.folder / f"{training[:16]}.pt"
         if (state := _read(path, training)) is None:
             state = train()
             _write(path, training, state)
@@ -62,33 +60,20 @@ class Finished:
 def _read(path: Path, training: str) -> State | None:
     """The state in a file; None where there is none, or none of this training."""
     try:
-        with safe_open(path, "pt") as file:
-            header = file.metadata() or {}
-            if header.get("training") != training:
-                return None
-            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dictionary)
-            state: State = json.loads(
-                header["state"], object_hook=lambda entry: tensors[entry[TENSOR]] if TENSOR in entry else entry
-            )
-            return state
-    except (OSError, SafetensorError, KeyError, ValueError):  # missing or damaged: the training is repeated
+        kept = torch.load(path, weights_only=True)
+        return dict(kept["state"]) if kept["training"] == training else None
+    except Exception:  # missing or damaged, for which torch has many kinds of errors: the training is repeated
         return None
 
 
 def _write(path: Path, training: str, state: State) -> None:
     """Keep a state. On a full disk the run goes on: it only saves time."""
-    tensors: dict[str, Tensor] = {}
-
-    def taken_out(value: Tensor) -> dict[str, str]:
-        name = str(len(tensors))
-        tensors[name] = value.detach().clone().contiguous()
-        return {TENSOR: name}
-
-    plain, partial = json.dumps(state, default=taken_out), beside(path)
+    content, partial = io.BytesIO(), beside(path)
+    torch.save({"training": training, "state": state}, content)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path)
-        partial.write_bytes(save(tensors, {"training": training, "state": plain}))
+        partial.write_bytes(content.getvalue())
         partial.replace(path)
     except OSError as error:
         warnings.warn(f"{path}: a finished training could not be kept: {error.strerror}", stacklevel=2)

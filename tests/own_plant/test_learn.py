@@ -230,6 +230,7 @@ def test_the_description_of_the_docs_is_one(tmp_path):
 def test_the_command_and_the_loop_of_the_docs_run_as_they_stand(tmp_path, quick_root, monkeypatch):
     (shell,), (python,) = blocks("sh"), blocks("python")
     words = shlex.split(shell, comments=True)
+    assert f"{shlex.join(words)}\n" in (PROJECT / "README.md").read_text(encoding="utf-8")  # which shows the same
     assert words[:4] == [".venv/bin/python", "-m", "helpers", "plant"]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plant_report, "pass_gate", lambda *given: replace(learn.pass_gate(*given), released=True))

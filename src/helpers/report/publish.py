@@ -171,9 +171,9 @@ def publish() -> None:
         _copy(LATEST / part, partial / part)
     for name, path in copies.items():
         _copy(path, partial / "notebooks" / name)
+    write_policies(first, partial / "policies")
     if (first / "inferred_settings").is_dir():
         _copy(first / "inferred_settings", partial / "inferred_settings")
-    write_policies(first, partial / "policies")
     for part in ("benchmarks", "inferred_settings", "reliability.md", "search"):  # runs of their own, which stay
         if (REFERENCE / part).exists() and not (partial / part).exists():
             _copy(REFERENCE / part, partial / part)

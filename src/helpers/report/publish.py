@@ -167,11 +167,11 @@ def publish() -> None:
         blocks["limits"] = limits_at_a_glance(pd.read_csv(LATEST / LIMITS))
     pages = filled([PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))], blocks)
     partial, old = _beside("partial"), _beside("old")
+    write_policies(first, partial / "policies")
     for part in PARTS:
         _copy(LATEST / part, partial / part)
     for name, path in copies.items():
         _copy(path, partial / "notebooks" / name)
-    write_policies(first, partial / "policies")
     if (first / "inferred_settings").is_dir():
         _copy(first / "inferred_settings", partial / "inferred_settings")
     for part in ("benchmarks", "inferred_settings", "reliability.md", "search"):  # runs of their own, which stay

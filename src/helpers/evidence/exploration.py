@@ -30,7 +30,7 @@ class Watched:
 
 
 def exploring_episodes(contest: Contest) -> pd.DataFrame:
-    """Every exploring episode of the case's online epochs, from the imitating policy (hot) and from an untrained one (scratch).
+    """Every exploring episode of the case's online epochs, from an imitating (hot), a cloned and an untrained policy (scratch).
 
     Beside each the episode that the PID would have had from the same initial state under the same disturbances. From scratch the
     first round has the smaller beta of `dense`, without which there is nothing to learn from; all are judged by the real
@@ -39,6 +39,7 @@ def exploring_episodes(contest: Contest) -> pd.DataFrame:
     online = contest.session.params.case.online
     starts = {
         "hot": (contest.imitator, online.beta),
+        "cloned": (contest.clone, online.beta),
         "scratch": (contest.session.fresh_policy(), (contest.limits.dense.beta, *online.beta[1:])),
     }
     return pd.concat([_explore(contest, name, *start) for name, start in starts.items()], ignore_index=True)

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
+from torch import nn
 
 from helpers.learning.policy import LSTMPolicy
 from helpers.plant.task import ControlTask, Trajectories
@@ -63,9 +64,14 @@ class Stage:
         return frame
 
     def policy(self, params: LearningParams, task: ControlTask) -> LSTMPolicy:
-        """The stage's policy, loaded without executing code, in the number type of the task."""
-        path = self.path("policy.safetensors")
+        """The stage's policy, in the number type of the task."""
         policy = LSTMPolicy(params.policy, len(task.set_point), len(task.input_low)).to(task.set_point.dtype)
+        self.into(policy)
+        return policy
+
+    def into(self, policy: nn.Module) -> None:
+        """Put the parameters of the stage's policy into a policy of its kind, without executing code."""
+        path = self.path("policy.safetensors")
         expected = policy.state_dict()
         try:
             found = load_tensors(path.read_bytes())
@@ -79,15 +85,14 @@ class Stage:
                 )
             if not found[name].isfinite().all():
                 raise ArtifactError(f"{path}: key '{name}': expected finite numbers; run the stage again")
-        policy.load_state_dict({name: tensor.to(task.set_point.dtype) for name, tensor in found.items()})
-        return policy
+        policy.load_state_dict(found)  # in the number type of the policy
 
 
 def save_stage(
     folder: Path,
     record: Mapping[str, Any],
     tables: Mapping[str, pd.DataFrame] | None = None,
-    policy: LSTMPolicy | None = None,
+    policy: nn.Module | None = None,
     figures: Mapping[str, Figure] | None = None,
 ) -> Stage:
     """Write a stage's results into `folder`, all of them or none, and return what was written.

@@ -10,8 +10,8 @@ import pandas as pd
 import torch
 from IPython.display import Markdown
 from matplotlib.figure import Figure
+from torch import nn
 
-from helpers.learning.policy import LSTMPolicy
 from helpers.runs import artifacts
 from helpers.runs.finished import Finished
 from helpers.runs.identity import changes, digest, identity, inputs, versions
@@ -92,7 +92,7 @@ class Run:
         self,
         stage: str,
         tables: Mapping[str, pd.DataFrame],
-        policy: LSTMPolicy | None = None,
+        policy: nn.Module | None = None,
         figures: Mapping[str, Figure] | None = None,
         last: bool = True,
     ) -> artifacts.Stage:

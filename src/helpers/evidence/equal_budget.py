@@ -120,10 +120,10 @@ def reinforced(
     def train() -> State:
         visitor(0, learner.average)
         while learner.epochs < n_epochs:
-            reward: Reward = partial(learner.features.tracking, beta=contest.sharpness(learner.episodes, dense))
             if early_reward and contest.early(learner.episodes):
-                reward = early_reward
-            algorithm_1(learner, reward, 1)
+                algorithm_1(learner, early_reward, 1)
+            else:
+                algorithm_1(learner, learner.tracking(contest.sharpness(learner.episodes, dense)), 1)
             if visitor.due(learner.episodes):
                 visitor(learner.episodes, learner.average)
         return {"policy": learner.average.state_dict(), "curve": visitor.curve}

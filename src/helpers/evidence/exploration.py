@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from helpers.evidence.equal_budget import Contest
-from helpers.learning.algorithm_1 import algorithm_1
+from helpers.learning.algorithm_1 import Reward, algorithm_1
 from helpers.learning.policy import LSTMPolicy
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
@@ -20,13 +20,13 @@ class Watched:
     """A reward that keeps the real objective of every exploring episode it is asked about."""
 
     contest: Contest
-    beta: float
+    reward: Reward
     seen: list[Tensor]
 
     def __call__(self, batch: Trajectories) -> Tensor:
-        """The rewards R_1..R_T with this beta, shape (T, K)."""
+        """Its rewards R_1..R_T, shape (T, K)."""
         self.seen.append(self.contest.returns(batch))
-        return self.contest.session.features.on("x").tracking(batch, self.beta)
+        return self.reward(batch)
 
 
 def exploring_episodes(contest: Contest) -> pd.DataFrame:
@@ -54,7 +54,7 @@ def _explore(contest: Contest, run: str, start: LSTMPolicy, betas: tuple[float, 
     for n_epochs, beta in zip(epochs, betas, strict=True):
         for _ in range(n_epochs):
             twin = torch.Generator().set_state(generator.get_state())
-            reward = Watched(contest, beta, [])
+            reward = Watched(contest, learner.tracking(beta), [])
             algorithm_1(learner, reward, 1)
             paired = contest.returns(rollout(session.process, session.expert, session.task, contest.batch, twin))
             columns = {"run": run, "epoch": learner.epochs, "objective": reward.seen[0].numpy(), "expert": paired.numpy()}

@@ -116,13 +116,17 @@ def reinforced(
     session, visitor = contest.session, Visitor(contest)
     policy, n_epochs = copied(start), -(-contest.scale.episodes // contest.batch)
     learner = session.online_learner(policy, contest.batch, n_epochs, session.stream("limits", purpose))
+    usual = learner.params
+    gentle = usual.model_copy(update={"learning_rate_start": usual.learning_rate_end})  # where a policy begins at its optimum
 
     def train() -> State:
         visitor(0, learner.average)
         while learner.epochs < n_epochs:
             if early_reward and contest.early(learner.episodes):
+                learner.params = gentle
                 algorithm_1(learner, early_reward, 1)
             else:
+                learner.params = usual
                 algorithm_1(learner, learner.tracking(contest.sharpness(learner.episodes, dense)), 1)
             if visitor.due(learner.episodes):
                 visitor(learner.episodes, learner.average)

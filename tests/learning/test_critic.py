@@ -3,10 +3,12 @@
 from dataclasses import replace
 from functools import partial
 
+import pytest
 import torch
 
 from helpers.learning.algorithm_1 import algorithm_1
 from helpers.learning.critic import Critic
+from helpers.learning.learner import TrainingError
 from helpers.plant.rollout import rollout
 
 
@@ -46,3 +48,9 @@ def test_without_a_tracking_reward_the_critic_is_silent(study):
     learner = case.learner(case.policy(), 5, 1, params)
     algorithm_1(learner, partial(case.features.tracking, beta=3.0), 1)
     assert not learner.critic.batches
+    batch = learner.realise()
+    nothing = torch.zeros(batch.n_steps, 5, dtype=batch.x.dtype)
+    with pytest.raises(TrainingError, match="the same reward"):
+        learner.advantage(nothing, batch)
+    learner.tracking(3.0)
+    assert not learner.advantage(nothing, batch).any()  # led by the critic alone, it asks for no difference between episodes

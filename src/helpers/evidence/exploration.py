@@ -1,32 +1,13 @@
 """The price of exploring: what every episode of online learning earned, beside the PID under the same disturbances."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pandas as pd
 import torch
-from torch import Tensor
 
 from helpers.evidence.equal_budget import Contest
-from helpers.learning.algorithm_1 import Reward, algorithm_1
 from helpers.learning.policy import LSTMPolicy
 from helpers.plant.rollout import rollout
-from helpers.plant.task import Trajectories
 from helpers.runs.study import copied
-
-
-@dataclass(frozen=True)
-class Watched:
-    """A reward that keeps the real objective of every exploring episode it is asked about."""
-
-    contest: Contest
-    reward: Reward
-    seen: list[Tensor]
-
-    def __call__(self, batch: Trajectories) -> Tensor:
-        """Its rewards R_1..R_T, shape (T, K)."""
-        self.seen.append(self.contest.returns(batch))
-        return self.reward(batch)
 
 
 def exploring_episodes(contest: Contest) -> pd.DataFrame:
@@ -52,12 +33,14 @@ def _explore(contest: Contest, run: str, start: LSTMPolicy, betas: tuple[float, 
     learner = session.online_learner(copied(start), contest.batch, sum(epochs), generator)
     frames = []
     for n_epochs, beta in zip(epochs, betas, strict=True):
-        for _ in range(n_epochs):
+        reward = learner.tracking(beta)
+        for _ in range(n_epochs):  # of Algorithm 1
             twin = torch.Generator().set_state(generator.get_state())
-            reward = Watched(contest, learner.tracking(beta), [])
-            algorithm_1(learner, reward, 1)
+            batch = learner.realise()
+            learner.ascend(batch, learner.advantage(reward(batch), batch))
             paired = contest.returns(rollout(session.process, session.expert, session.task, contest.batch, twin))
-            columns = {"run": run, "epoch": learner.epochs, "objective": reward.seen[0].numpy(), "expert": paired.numpy()}
+            earned = contest.returns(batch).numpy()
+            columns = {"run": run, "epoch": learner.epochs, "objective": earned, "expert": paired.numpy()}
             frames.append(pd.DataFrame(columns))
     episodes = pd.concat(frames, ignore_index=True)
     return episodes.assign(episode=np.arange(1, len(episodes) + 1))[["run", "epoch", "episode", "objective", "expert"]]

@@ -165,6 +165,11 @@ class Learner:
         self.beta = beta
         return partial(self.features.tracking, beta=beta)
 
+    @property
+    def led(self) -> float:
+        """The share of the gradient that the critic gives."""
+        return self.params.critic if self.beta else 0.0
+
     def realise(self) -> Trajectories:
         """Step 1 of Algorithm 1: K episodes of T steps under the exploring policy."""
         task, recording = self.features.task, self.n_episodes <= BLOCK
@@ -187,6 +192,8 @@ class Learner:
         if not torch.isfinite(advantage).all():
             raise TrainingError(f"epoch {self.epochs + 1}: the return of the policy is not finite")
         spread = advantage.std()
+        if not spread > 0 and self.led == 1:
+            return advantage  # nobody asks for it
         if not spread > 0:
             raise TrainingError(f"epoch {self.epochs + 1}: every episode earned the same reward, so there is nothing to learn from")
         return advantage / spread
@@ -246,8 +253,7 @@ class Learner:
         """
         params, task = self.params, self.features.task
         n_steps = params.passes * params.minibatches
-        led = params.critic if self.beta else 0.0
-        if led:
+        if led := self.led:
             self.critic.learn(batch)
         edges = [self.n_episodes * part // params.minibatches for part in range(params.minibatches + 1)]
         drawn = None

@@ -14,6 +14,7 @@ from torch import Tensor
 from helpers.learning.features import FeatureMap
 from helpers.plant.task import Trajectories
 
+RIDGE = 1e-9  # share of each regressor's own size
 LEAST = 1e-5  # variance of a normalised error, below which none is believed
 
 
@@ -33,11 +34,11 @@ class Critic:
         seen = torch.cat([torch.ones_like(batch.u[..., :1]), batch.y[:-1], batch.u], dim=-1)
         self.batches.append((seen.flatten(0, 1).double(), self.features.errors(batch).flatten(0, 1).double()))
         x, error = (torch.cat(part) for part in zip(*self.batches, strict=True))
-        self.mean = torch.linalg.lstsq(x, error).solution
+        self.mean = _regressed(x, error)
         spread = (error - x @ self.mean) ** 2
         n_y = error.shape[1]
         scale = torch.stack([torch.ones_like(error), x[:, 1 : 1 + n_y] ** 2], dim=-1)  # of each loop 1 and y^2
-        self.variance = torch.linalg.lstsq(scale.transpose(0, 1), spread.T[..., None]).solution[..., 0]
+        self.variance = _regressed(scale.transpose(0, 1), spread.T[..., None])[..., 0]
 
     def value(self, y: Tensor, u: Tensor, beta: float) -> Tensor:
         """q: the expected sum of exp(-(beta e)^2) over the loops one sample after y (..., n_y) and u (..., n_u); shape (...)."""
@@ -45,3 +46,10 @@ class Critic:
         expected = torch.cat([torch.ones_like(u[..., :1]), y, u], dim=-1) @ mean
         wide = 1 + 2 * beta**2 * (variance[:, 0] + variance[:, 1] * y**2).clamp(min=LEAST)
         return (torch.exp(-((beta * expected) ** 2) / wide) / wide.sqrt()).sum(-1)
+
+
+def _regressed(design: Tensor, target: Tensor) -> Tensor:
+    """Least squares by the normal equations, which, unlike torch's own, give the same bits wherever the arrays lie in memory."""
+    products = design.mT @ design
+    ridge = RIDGE * products.diagonal(dim1=-2, dim2=-1).clamp(min=1.0).diag_embed()  # an input that stood still has no effect
+    return torch.linalg.solve(products + ridge, design.mT @ target)

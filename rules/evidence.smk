@@ -34,6 +34,7 @@ rule limits:
     input:
         made_from("06_limits_and_alternatives", record("limits_safety")),
         learned,
+        record("one_policy", f"{SEED}/case_1"),
     output:
         [record(f"limits_{part}") for part in ("attainable", "budget", "quality", "robustness", "safety")],
     log:

@@ -9,7 +9,9 @@ import torch
 
 from helpers.evidence import equal_budget, exploration, limits, robustness
 from helpers.evidence.attainable import Tabulated
+from helpers.evidence.scheduled_pid import ScheduledPID
 from helpers.learning.evaluation import objective
+from helpers.plant.controllers import PID
 from helpers.report import limits_answer
 from helpers.report.limits_figures import LABELS, budget_curves, gap_figure, heat_maps, regret_figure
 
@@ -31,7 +33,7 @@ def attained(contest):
 
 @pytest.fixture(scope="module")
 def learned(contest):
-    return equal_budget.learn_all(contest)
+    return equal_budget.learn_all(contest) | {"one_policy": limits.through_the_model(contest)}
 
 
 def test_the_grids_say_whether_they_agree(contest, attained):
@@ -46,7 +48,8 @@ def test_the_grids_say_whether_they_agree(contest, attained):
 @pytest.mark.torture
 def test_every_alternative_has_a_curve_and_spends_no_more_than_its_budget(contest, learned):
     curves = equal_budget.curves(learned)
-    assert set(learned) == {"clone", "irl_reinforce", "clone_reinforce", "scratch_reinforce", "pid_tuned", "mpc"}
+    ending = {f"{start}_reinforce" for start in ("irl", "clone", "csil", "scratch")}
+    assert set(learned) == {"clone", *ending, "pid_tuned", "pid_scheduled", "mpc", "one_policy"}
     assert set(learned) < set(LABELS)
     for name, curve in curves.groupby("learner"):
         assert curve["episodes"].min() == 0
@@ -54,7 +57,8 @@ def test_every_alternative_has_a_curve_and_spends_no_more_than_its_budget(contes
         assert curve["episodes"].is_monotonic_increasing
     last = curves.groupby("learner")["episodes"].max()
     assert last[["irl_reinforce", "scratch_reinforce"]].tolist() == [24, 24]
-    assert last[["clone", "mpc"]].tolist() == [0, 0]
+    assert last[["clone", "mpc", "one_policy"]].tolist() == [0, 0, 0]
+    assert 0 < last["pid_tuned"] <= 24
 
 
 @pytest.mark.torture
@@ -64,11 +68,56 @@ def test_what_does_not_learn_keeps_its_value_at_every_budget(contest, learned):
     assert (table.loc["mpc"] == table.loc["mpc", 0]).all()
     assert table.notna().all(axis=None)
     returns = contest.returns(contest.session.fresh(contest.session.expert, contest.scale.judged))
-    assert table.loc["pid_tuned", 0] == pytest.approx(returns.mean().item())  # the search begins with the demonstrator
+    for name in ("pid_tuned", "pid_scheduled"):  # the searches begin with the demonstrator
+        assert table.loc[name, 0] == pytest.approx(returns.mean().item())
+
+
+def test_constant_weights_schedule_nothing_and_others_follow_the_error(contest):
+    session, gains = contest.session, {"proportional": (2.0, -3.0), "integral": (0.5, -1.0), "derivative": (0.1, 0.2)}
+    given, dt = session.params.demonstrator.model_copy(update=gains), session.params.process.sampling_time
+    unit, target = torch.tensor([0.1, 0.4], dtype=torch.float64), session.task.set_point
+    observed = torch.randn(6, 4, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def commands(controller):
+        memory, found = controller.start(4, 6, torch.Generator()), []
+        for y in observed:
+            u, memory = controller.act(y, memory)
+            found.append(u)
+        return torch.stack(found)
+
+    def scheduled(weights):
+        return ScheduledPID(weights, given, 0.1, unit, target, session.task, dt)
+
+    weights = torch.zeros(2, ScheduledPID.n_weights(2, 3), dtype=torch.float64)
+    plain = commands(scheduled(weights))
+    assert torch.allclose(plain, commands(PID(given, target, dt)))
+    weights[1, -24:] = torch.tensor([0.0, 0.0, 0.0, 2.0], dtype=torch.float64).log1p().repeat(6)  # every constant ln 3
+    weights[1, -8:] = 0
+    tripled = given.model_copy(update={name: tuple(3 * gain for gain in gains[name]) for name in ("proportional", "integral")})
+    both = commands(scheduled(weights))
+    assert torch.allclose(both[:, :2], plain[:, :2])  # the first of two controllers side by side
+    assert torch.allclose(both[:, 2:], commands(PID(tripled, target, dt))[:, 2:])
+    weights[0, 0], weights[0, -24] = 1.0, 1.0  # a cell that sees the first error, and the first gain that follows it
+    error = (target - observed[0]) / unit
+    p, _, _ = scheduled(weights).gains(target - observed[0])
+    assert torch.allclose(p[:2, 0], 2.0 * torch.tanh(error[:2, 0]).exp())
+
+
+def test_the_coherent_reward_is_greatest_where_the_clone_acts(contest):
+    """As Watson et al. 2023 have it: ln of a ratio of densities, nought where the clone is as likely as an even input."""
+    batch, task = contest.demonstrations.trajectories, contest.session.task
+    reward = equal_budget.coherent_reward(contest, contest.clone)
+    mode = contest.clone(batch.y, batch.u, task)[0].detach()
+    spread = (mode - batch.u).square().mean((0, 1)).sqrt()
+    span = task.input_high - task.input_low
+    best = reward(replace(batch, command=mode))
+    assert torch.allclose(best, (span / (spread * (2 * torch.pi) ** 0.5)).log().sum().expand_as(best))
+    away = reward(replace(batch, command=mode + torch.tensor([1.0, 2.0]) * spread))
+    assert torch.allclose(best - away, torch.full_like(best, 2.5))
 
 
 def test_the_reward_is_dense_at_first_where_asked(contest):
-    assert [contest.sharpness(episodes, True) for episodes in (0, 2, 3, 24)] == [10.0, 10.0, 30.0, 30.0]
+    assert [contest.sharpness(episodes, True) for episodes in (0, 2, 3, 24)] == [3.0, 3.0, 30.0, 30.0]
     assert contest.sharpness(0, False) == 30.0
 
 
@@ -154,9 +203,10 @@ def test_nominal_conditions_give_the_nominal_objective(contest):
 
 def test_exploring_is_paired_with_the_pid_on_the_same_draws(contest):
     episodes = exploration.exploring_episodes(contest)
-    assert episodes.groupby("run", sort=False).size().tolist() == [2 * contest.batch] * 2  # one epoch in each of two rounds
-    hot, scratch = (group["expert"].to_numpy() for _, group in episodes.groupby("run", sort=False))
-    assert hot == pytest.approx(scratch)  # both runs draw from the same stream, whatever their policies do
+    assert episodes.groupby("run", sort=False).size().tolist() == [2 * contest.batch] * 3  # one epoch in each of two rounds
+    hot, cloned, scratch = (group["expert"].to_numpy() for _, group in episodes.groupby("run", sort=False))
+    assert hot == pytest.approx(scratch)  # all runs draw from the same stream, whatever their policies do
+    assert hot == pytest.approx(cloned)
     found = exploration.safety(episodes).set_index("run").loc["scratch"]
     rows = episodes[episodes["run"] == "scratch"]
     assert found["worst"] == rows["objective"].min()
@@ -179,6 +229,7 @@ def test_figures_show_the_tables(contest):
     wanted = robust.query("group == 'time' and controller == 'mpc'")["objective"]
     assert texts == [f"{value:.1f}" for value in wanted]
     episodes = pd.DataFrame({"run": "hot", "epoch": [1, 1, 2], "episode": [1, 2, 3], "objective": [1.0, 5.0, 4.0], "expert": 3.0})
-    left, right = regret_figure(episodes).axes
+    dip, left, right = regret_figure(episodes).axes
+    assert dip.lines[0].get_ydata() == pytest.approx([100.0, 400 / 3])
     assert left.lines[0].get_ydata().tolist() == [1.0, 4.0]
     assert right.lines[0].get_ydata().tolist() == [2.0, 0.0, -1.0]

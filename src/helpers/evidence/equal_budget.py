@@ -5,7 +5,7 @@ Every learner gives a curve (the objective of its mode against the plant episode
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import cma
 import numpy as np
@@ -16,20 +16,19 @@ from torch import Tensor
 from helpers.evidence.alternatives import cloned
 from helpers.evidence.experiments import Prepared
 from helpers.evidence.mpc import OffsetFreeMPC
-from helpers.learning.algorithm_1 import algorithm_1
+from helpers.evidence.scheduled_pid import ScheduledPID
+from helpers.learning.algorithm_1 import Reward, algorithm_1
 from helpers.learning.evaluation import objective
-from helpers.learning.policy import LSTMPolicy
-from helpers.plant.controllers import PID, Controller
+from helpers.learning.policy import LSTMPolicy, log_density
+from helpers.plant.controllers import Controller
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
 from helpers.runs.finished import State
 from helpers.runs.study import Study, copied
 from helpers.settings.leaf import InputError
 from helpers.settings.limits import LimitsParams, LimitsScaleParams
-from helpers.settings.paper import GainParams
 
 Build = Callable[[Study], Controller]  # the same controller, told of the set point of that session
-KINDS = ("proportional", "integral", "derivative")
 CURVE = ("learner", "episodes", "objective", "standard_error")
 
 
@@ -58,10 +57,18 @@ class Contest(Prepared):
         """The sharpness of the real objective."""
         return self.session.params.case.online.headline_beta
 
+    def early(self, episodes: int) -> bool:
+        """Whether the first part of the budget, of `dense`, still lasts after so many episodes."""
+        return episodes < self.limits.dense.share * self.scale.episodes
+
     def sharpness(self, episodes: int, dense: bool) -> float:
         """Beta of the reward after so many episodes; where `dense`, it begins with the smaller one."""
-        early = episodes < self.limits.dense.share * self.scale.episodes
-        return self.limits.dense.beta if dense and early else self.beta
+        return self.limits.dense.beta if dense and self.early(episodes) else self.beta
+
+    @cached_property
+    def clone(self) -> LSTMPolicy:
+        """The policy that behavioural cloning learns from the demonstrations."""
+        return cloned(self, self.demonstrations.trajectories)
 
     def returns(self, trajectories: Trajectories) -> Tensor:
         """The real objective of each trajectory on the true state, shape (K,)."""
@@ -98,16 +105,29 @@ class Visitor:
         self.curve.append((episodes, returns.mean().item(), returns.std().item() / len(returns) ** 0.5))
 
 
-def reinforced(contest: Contest, start: LSTMPolicy, purpose: str, dense: bool) -> Learned:
-    """Algorithm 1 on the real objective with the online settings of learning.yaml, from a given policy."""
+def reinforced(
+    contest: Contest, start: LSTMPolicy, purpose: str, dense: bool = False, early_reward: Reward | None = None
+) -> Learned:
+    """Algorithm 1 on the real objective with the online settings of learning.yaml, from a given policy.
+
+    Args:
+        dense: it begins with the smaller beta of `dense`. early_reward: what it begins with instead.
+    """
     session, visitor = contest.session, Visitor(contest)
     policy, n_epochs = copied(start), -(-contest.scale.episodes // contest.batch)
     learner = session.online_learner(policy, contest.batch, n_epochs, session.stream("limits", purpose))
+    usual = learner.params
+    gentle = usual.model_copy(update={"learning_rate_start": usual.learning_rate_end})  # where a policy begins at its optimum
 
     def train() -> State:
         visitor(0, learner.average)
         while learner.epochs < n_epochs:
-            algorithm_1(learner, partial(learner.features.tracking, beta=contest.sharpness(learner.episodes, dense)), 1)
+            if early_reward and contest.early(learner.episodes):
+                learner.params = gentle
+                algorithm_1(learner, early_reward, 1)
+            else:
+                learner.params = usual
+                algorithm_1(learner, learner.tracking(contest.sharpness(learner.episodes, dense)), 1)
             if visitor.due(learner.episodes):
                 visitor(learner.episodes, learner.average)
         return {"policy": learner.average.state_dict(), "curve": visitor.curve}
@@ -116,44 +136,84 @@ def reinforced(contest: Contest, start: LSTMPolicy, purpose: str, dense: bool) -
     return Learned(partial(_deployed, copied(policy, kept["policy"])), visitor.read(kept["curve"]))
 
 
+def coherent_reward(contest: Contest, clone: LSTMPolicy) -> Reward:
+    """CSIL's reward, under which the clone is optimal already: ln of its density over that of an even one (Watson et al. 2023).
+
+    The spread of the clone is that of the recorded inputs about its mode, Watson et al. 2023, Eq. 9 with an even prior.
+    """
+    task, recorded = contest.session.task, contest.demonstrations.trajectories
+
+    def mode(batch: Trajectories) -> Tensor:
+        with torch.no_grad():
+            return clone(batch.y, batch.u, task)[0]
+
+    spread = (mode(recorded) - recorded.u).square().mean((0, 1)).sqrt()
+    even = (task.input_high - task.input_low).log().sum()
+    return lambda batch: log_density(batch.command, mode(batch), spread) + even
+
+
 def _deployed(policy: LSTMPolicy, session: Study) -> Controller:
     return session.deploy(policy)
 
 
-def retuned(contest: Contest) -> Learned:
-    """The PID with gains tuned by CMA-ES on the real objective, every candidate judged on episodes of its own (Hansen 2016).
+def searched(contest: Contest, purpose: str, cells: int, set_point_factors: Sequence[float]) -> Learned:
+    """The gains of a PID, or with `cells` the network that schedules them, by CMA-ES on the real objective (Hansen 2016).
 
-    The gains are searched in units of those of the demonstrator and stay positive. The curve is that of the search's mean.
+    Several searches for constant gains, from the demonstrator with less and less integral action, take turns for the first half of
+    the budget. The best of them has the other half, or the network that begins with its gains. Every candidate is judged on
+    episodes of its own, spread over the set points. The curve is that of the mean of the search that is best so far.
     """
     session, params, visitor = contest.session, contest.limits.tuning, Visitor(contest)
-    start, generator = session.params.demonstrator, session.stream("limits", "tuning")
-    proportional, integral = np.array(start.proportional), np.array(start.integral)
-    derivative = params.derivative_unit * proportional * session.params.process.sampling_time
-    unit = np.concatenate([proportional, integral, np.maximum(derivative, start.derivative)])
-    first = np.concatenate([proportional, integral, start.derivative]) / unit
-    options = {"bounds": [0, None], "seed": int(torch.randint(1, 2**31, (1,), generator=generator)), "verbose": -9}
-    search = cma.CMAEvolutionStrategy(first, params.initial_step, options)
+    generator, n_y = session.stream("limits", purpose), len(session.task.set_point)
+    target = session.params.case.set_point
+    runs = [session.varied(case={"set_point": tuple(factor * entry for entry in target)}) for factor in set_point_factors]
+    each = -(-params.episodes // len(runs))
 
-    def gains(point: np.ndarray) -> GainParams:
-        kinds = np.split(point * unit, 3)
-        return start.model_copy(update={name: tuple(kind.tolist()) for name, kind in zip(KINDS, kinds, strict=True)})
+    def costs(candidates: np.ndarray) -> np.ndarray:
+        """Less the mean objective of each candidate (P, n), from as many episodes at each set point; (P,)."""
+        found = np.zeros(len(candidates))
+        for run in runs:
+            batch = rollout(run.process, _scheduled(contest, candidates, run), run.task, each * len(candidates), generator)
+            found -= objective(batch, run.features.on("x"), contest.beta).double().view(len(candidates), each).mean(1).numpy()
+        return found / len(runs)
 
-    def pid(found: GainParams, run: Study) -> Controller:
-        return PID(found, run.task.set_point, run.params.process.sampling_time)
+    def begun(start: np.ndarray) -> cma.CMAEvolutionStrategy:
+        options = {"seed": int(torch.randint(1, 2**31, (1,), generator=generator)), "verbose": -9}
+        return cma.CMAEvolutionStrategy(start, params.initial_step * 3 * n_y / len(start), options)
 
-    visitor(0, pid(start, session))
-    spent, mean = 0, first
-    while spent + params.episodes * search.popsize <= contest.scale.episodes:
-        points, costs = search.ask(), []
-        for point in points:
-            batch = rollout(session.process, pid(gains(point), session), session.task, params.episodes, generator)
-            costs.append(-contest.returns(batch).mean().item())
-        search.tell(points, costs)
-        before, spent = spent, spent + params.episodes * len(points)
-        mean = np.asarray(search.result.xfavorite)
+    def network(gains: np.ndarray) -> np.ndarray:
+        """Weights of the network that gives these constants, (3 n_y,), whatever it sees."""
+        weights = np.zeros(ScheduledPID.n_weights(n_y, cells))
+        weights[-3 * n_y * (cells + 1) :].reshape(3 * n_y, cells + 1)[:, -1] = gains
+        return weights
+
+    starts = np.zeros((len(params.integral_factors), 3, n_y))
+    starts[:, 1] = np.log(params.integral_factors)[:, None]
+    searches, spent = [begun(start.ravel()) for start in starts], 0
+    searches = searches[: max(1, contest.scale.episodes // (each * len(runs) * searches[0].popsize))]
+    best, constant = searches[0], True
+    visitor(0, _scheduled(contest, best.mean[None], session))
+    while spent + (turn := each * len(runs) * sum(search.popsize for search in searches)) <= contest.scale.episodes:
+        values = []
+        for search in searches:
+            points = search.ask()
+            found = costs(np.stack(points))
+            search.tell(points, found.tolist())
+            values.append(np.median(found))
+        before, spent, best = spent, spent + turn, searches[int(np.argmin(values))]
         if before // contest.scale.every < spent // contest.scale.every:
-            visitor(spent, pid(gains(mean), session))
-    return Learned(partial(pid, gains(mean)), visitor.curve)
+            visitor(spent, _scheduled(contest, best.mean[None], session))
+        if constant and spent >= contest.scale.episodes / 2:
+            searches, constant = [begun(network(best.mean)) if cells else best], False
+    return Learned(partial(_scheduled, contest, best.mean[None]), visitor.curve)
+
+
+def _scheduled(contest: Contest, weights: np.ndarray, run: Study) -> Controller:
+    """The PIDs that such weights (P, n) make, told of the set point of a run."""
+    params, nominal, dtype = contest.session.params, contest.session.task.set_point, contest.session.dtype
+    unit = torch.tensor(params.learning.policy.error_unit, dtype=dtype)
+    dt, step = params.process.sampling_time, contest.limits.tuning.derivative_unit
+    return ScheduledPID(torch.as_tensor(weights).to(dtype), params.demonstrator, step, unit, nominal, run.task, dt)
 
 
 def from_library(contest: Contest, name: str) -> Learned:
@@ -206,12 +266,14 @@ def predictive(contest: Contest) -> Learned:
 
 def learn_all(contest: Contest) -> dict[str, Learned]:
     """Every alternative by name, in the order of the report."""
-    clone = cloned(contest, contest.demonstrations.trajectories)
+    clone, tuning = contest.clone, contest.limits.tuning
     learned = {
-        "irl_reinforce": reinforced(contest, contest.imitator, "hot", False),
-        "clone_reinforce": reinforced(contest, clone, "cloned", False),
-        "scratch_reinforce": reinforced(contest, contest.session.fresh_policy(), "scratch", True),
-        "pid_tuned": retuned(contest),
+        "irl_reinforce": reinforced(contest, contest.imitator, "hot"),
+        "clone_reinforce": reinforced(contest, clone, "cloned"),
+        "csil_reinforce": reinforced(contest, clone, "coherent", early_reward=coherent_reward(contest, clone)),
+        "scratch_reinforce": reinforced(contest, contest.session.fresh_policy(), "scratch", dense=True),
+        "pid_tuned": searched(contest, "tuning", 0, (1.0,)),
+        "pid_scheduled": searched(contest, "scheduling", tuning.cells, contest.limits.robustness.set_point_factors),
         "mpc": predictive(contest),
     }
     if contest.scale.library:

@@ -1,36 +1,17 @@
 """The price of exploring: what every episode of online learning earned, beside the PID under the same disturbances."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pandas as pd
 import torch
-from torch import Tensor
 
 from helpers.evidence.equal_budget import Contest
-from helpers.learning.algorithm_1 import algorithm_1
 from helpers.learning.policy import LSTMPolicy
 from helpers.plant.rollout import rollout
-from helpers.plant.task import Trajectories
 from helpers.runs.study import copied
 
 
-@dataclass(frozen=True)
-class Watched:
-    """A reward that keeps the real objective of every exploring episode it is asked about."""
-
-    contest: Contest
-    beta: float
-    seen: list[Tensor]
-
-    def __call__(self, batch: Trajectories) -> Tensor:
-        """The rewards R_1..R_T with this beta, shape (T, K)."""
-        self.seen.append(self.contest.returns(batch))
-        return self.contest.session.features.on("x").tracking(batch, self.beta)
-
-
 def exploring_episodes(contest: Contest) -> pd.DataFrame:
-    """Every exploring episode of the case's online epochs, from the imitating policy (hot) and from an untrained one (scratch).
+    """Every exploring episode of the case's online epochs, from an imitating (hot), a cloned and an untrained policy (scratch).
 
     Beside each the episode that the PID would have had from the same initial state under the same disturbances. From scratch the
     first round has the smaller beta of `dense`, without which there is nothing to learn from; all are judged by the real
@@ -39,6 +20,7 @@ def exploring_episodes(contest: Contest) -> pd.DataFrame:
     online = contest.session.params.case.online
     starts = {
         "hot": (contest.imitator, online.beta),
+        "cloned": (contest.clone, online.beta),
         "scratch": (contest.session.fresh_policy(), (contest.limits.dense.beta, *online.beta[1:])),
     }
     return pd.concat([_explore(contest, name, *start) for name, start in starts.items()], ignore_index=True)
@@ -51,12 +33,14 @@ def _explore(contest: Contest, run: str, start: LSTMPolicy, betas: tuple[float, 
     learner = session.online_learner(copied(start), contest.batch, sum(epochs), generator)
     frames = []
     for n_epochs, beta in zip(epochs, betas, strict=True):
-        for _ in range(n_epochs):
+        reward = learner.tracking(beta)
+        for _ in range(n_epochs):  # of Algorithm 1
             twin = torch.Generator().set_state(generator.get_state())
-            reward = Watched(contest, beta, [])
-            algorithm_1(learner, reward, 1)
+            batch = learner.realise()
+            learner.ascend(batch, learner.advantage(reward(batch), batch))
             paired = contest.returns(rollout(session.process, session.expert, session.task, contest.batch, twin))
-            columns = {"run": run, "epoch": learner.epochs, "objective": reward.seen[0].numpy(), "expert": paired.numpy()}
+            earned = contest.returns(batch).numpy()
+            columns = {"run": run, "epoch": learner.epochs, "objective": earned, "expert": paired.numpy()}
             frames.append(pd.DataFrame(columns))
     episodes = pd.concat(frames, ignore_index=True)
     return episodes.assign(episode=np.arange(1, len(episodes) + 1))[["run", "epoch", "episode", "objective", "expert"]]

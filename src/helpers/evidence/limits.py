@@ -6,8 +6,9 @@ import numpy as np
 import pandas as pd
 from torch import Tensor
 
+from helpers.evidence import one_policy
 from helpers.evidence.attainable import Optimum, Resolution, Tabulated, dynamic_programme, grid_around
-from helpers.evidence.equal_budget import Build, Contest, Learned
+from helpers.evidence.equal_budget import Build, Contest, Learned, Visitor
 from helpers.evidence.experiments import prepare
 from helpers.evidence.kalman import Filtered
 from helpers.learning.control_quality import harris_index, quality
@@ -15,6 +16,7 @@ from helpers.learning.evaluation import objective
 from helpers.plant.controllers import Controller
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
+from helpers.plant.tracking import AtSetPoint
 from helpers.runs.session import Session
 from helpers.runs.study import Study
 from helpers.settings.limits import load_limits
@@ -101,6 +103,17 @@ def of_the_paper(contest: Contest) -> dict[str, Build]:
         "offline": lambda run: run.deploy(contest.imitator),
         "online": lambda run: run.deploy(contest.improved),
     }
+
+
+def through_the_model(contest: Contest) -> Learned:
+    """Notebook 09's policy for every set point, trained by the gradient through the model: it needs no episode of the plant."""
+    policy, visitor = one_policy.stored(contest.session), Visitor(contest)
+
+    def build(run: Study) -> Controller:
+        return AtSetPoint(policy, run.task)
+
+    visitor(0, build(contest.session))
+    return Learned(build, visitor.curve)
 
 
 def gaps(contest: Contest, optima: Mapping[float, Optimum], learned: Mapping[str, Learned]) -> pd.DataFrame:

@@ -215,6 +215,14 @@ def learn(ground: Ground, purpose: str, robust: bool = False, constrained: bool 
     return policy, pd.DataFrame(kept["records"])
 
 
+def stored(session: Session) -> TrackingPolicy:
+    """The policy that notebook 09 trained for the same seed."""
+    ground = enter(session)
+    policy = ground.policy(ground.record)
+    session.load("one_policy", "09_one_policy", case=1).into(policy)
+    return policy
+
+
 def starts(ground: Ground) -> tuple[pd.DataFrame, pd.DataFrame]:
     """What the hot start brings: the same training from the demonstrating PID and from nothing.
 

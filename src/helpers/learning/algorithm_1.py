@@ -1,7 +1,6 @@
 """Algorithm 1: REINFORCE with a baseline, Section 3.2, and its use online, Section 5.1.2."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 
 from torch import Tensor
 
@@ -48,6 +47,5 @@ def improve_online(
     """Online learning, Section 5.1.2: rounds of Algorithm 1 under the tracking objective, each with its own beta."""
     records: list[EpochRecord] = []
     for n_epochs, beta in zip(epochs, betas, strict=True):
-        reward = partial(learner.features.tracking, beta=beta)
-        records += algorithm_1(learner, reward, n_epochs, learner.params.patience, watch)
+        records += algorithm_1(learner, learner.tracking(beta), n_epochs, learner.params.patience, watch)
     return records

@@ -1,16 +1,19 @@
 """What Algorithm 1 is made of: returns and advantages, surrogates of the policy gradient, and the learner that takes the steps.
 
 As printed: the whole return less its mean over the batch, and one plain step an epoch. Ours are reward-to-go with a regression
-baseline, clipped steps on minibatches, an entropy bonus, a step size that falls, and a running average of the weights.
+baseline, clipped steps on minibatches, an entropy bonus, a critic, a step size that falls, and a running average of the weights.
 """
 
 import copy
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from helpers.learning.critic import Critic
 from helpers.learning.evaluation import expected_features
 from helpers.learning.features import FeatureMap, accumulated_error, discounts, normalised_error
 from helpers.learning.lstm import Tape
@@ -154,7 +157,18 @@ class Learner:
         self.generator = generator
         self.optimiser, self.rate = Adam(policy.parameters()), params.learning_rate_start
         self.epochs = self.episodes = self.gradient_steps = 0
+        self.critic, self.beta = Critic(features), 0.0  # without beta, of no use
         self._tape: Tape | None = None
+
+    def tracking(self, beta: float) -> Callable[[Trajectories], Tensor]:
+        """The reward of Eq. 5.1.2.1 with this beta; from now on the critic, if there is one, learns under the same."""
+        self.beta = beta
+        return partial(self.features.tracking, beta=beta)
+
+    @property
+    def led(self) -> float:
+        """The share of the gradient that the critic gives."""
+        return self.params.critic if self.beta else 0.0
 
     def realise(self) -> Trajectories:
         """Step 1 of Algorithm 1: K episodes of T steps under the exploring policy."""
@@ -178,6 +192,8 @@ class Learner:
         if not torch.isfinite(advantage).all():
             raise TrainingError(f"epoch {self.epochs + 1}: the return of the policy is not finite")
         spread = advantage.std()
+        if not spread > 0 and self.led == 1:
+            return advantage  # nobody asks for it
         if not spread > 0:
             raise TrainingError(f"epoch {self.epochs + 1}: every episode earned the same reward, so there is nothing to learn from")
         return advantage / spread
@@ -235,8 +251,10 @@ class Learner:
         A single step is the plain policy gradient; with more, every step after the first meets a batch that an older
         policy drew, and the clipped ratio corrects for it.
         """
-        params = self.params
+        params, task = self.params, self.features.task
         n_steps = params.passes * params.minibatches
+        if led := self.led:
+            self.critic.learn(batch)
         edges = [self.n_episodes * part // params.minibatches for part in range(params.minibatches + 1)]
         drawn = None
         if n_steps > 1:
@@ -255,7 +273,10 @@ class Learner:
                 else:
                     gain = clipped_surrogate(log_probability, drawn[:, rows], advantage[:, rows], params.ratio_clip)
                 if params.entropy:
-                    gain = gain + params.entropy * entropy(std, self.features.task).sum(0).mean()
+                    gain = gain + params.entropy * entropy(std, task).sum(0).mean()
+                if led:
+                    q = self.critic.value(batch.y[:-1, rows], mean.clamp(task.input_low, task.input_high), self.beta)
+                    gain = (1 - led) * gain + led * q.sum(0).mean()
                 (-gain * (rows.stop - rows.start) / (last - first)).backward()
             for name, parameter in self.policy.named_parameters():
                 if parameter.grad is not None and not parameter.grad.isfinite().all():

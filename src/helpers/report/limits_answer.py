@@ -4,8 +4,8 @@ import pandas as pd
 
 from helpers.report.limits_figures import LABELS
 
-NO_LEARNERS = ("clone", "mpc")
-WITH_MODEL = ("mpc", "minimum_variance", "minimum_variance_filtered")
+NO_LEARNERS = ("clone", "mpc", "one_policy")
+WITH_MODEL = ("one_policy", "mpc", "minimum_variance", "minimum_variance_filtered")
 
 
 def answer(found: pd.DataFrame, budget: pd.DataFrame) -> str:
@@ -20,7 +20,7 @@ def answer(found: pd.DataFrame, budget: pd.DataFrame) -> str:
     for episodes in budget.columns:
         best = learners[episodes].idxmax()
         lines.append(f"after {episodes:,} episodes {LABELS[best]} is best, $J$ = {learners.loc[best, episodes]:.1f}")
-    model = {name: found.loc[name] for name in WITH_MODEL}
+    model = {name: found.loc[name] for name in WITH_MODEL if name in found.index}
     known = ", ".join(f"{LABELS[name]} {row['objective']:.1f} ({row['gap']:.1f} %)" for name, row in model.items())
     ahead = learners.columns[(learners > found.loc["mpc", "objective"]).any()]
     passed = f"from {ahead[0]:,} episodes on" if len(ahead) else "at none of these budgets"

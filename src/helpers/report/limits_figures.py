@@ -20,13 +20,15 @@ LABELS = {
     "online": "online policy",
     "online_there": "improved on that plant",
     "clone": "cloning",
-    "irl_reinforce": "IRL, then REINFORCE",
-    "clone_reinforce": "cloning, then REINFORCE",
-    "scratch_reinforce": "REINFORCE from scratch",
+    "irl_reinforce": "IRL, then policy gradient",
+    "clone_reinforce": "cloning, then policy gradient",
+    "csil_reinforce": "CSIL, then policy gradient",
+    "scratch_reinforce": "policy gradient from scratch",
     "ppo": "PPO from scratch",
     "recurrent_ppo": "RecurrentPPO from scratch",
     "pid_tuned": "PID, tuned",
-    "one_policy": "one policy for all",
+    "pid_scheduled": "PID, gains scheduled",
+    "one_policy": "one policy, through the model",
     "one_policy_robust": "the same, robust",
     "one_policy_constrained": "the same, calm",
     "mpc": "offset-free MPC",
@@ -36,8 +38,18 @@ LABELS = {
     "dynamic_programme_filtered": "programme, filtered y",
     "dynamic_programme": "programme on x",
 }
-LEARNERS = ("irl_reinforce", "clone_reinforce", "scratch_reinforce", "ppo", "recurrent_ppo", "pid_tuned")
-LEVELS = ("mpc", "minimum_variance", "expert", "dynamic_programme")
+LEARNERS = (
+    "irl_reinforce",
+    "clone_reinforce",
+    "csil_reinforce",
+    "scratch_reinforce",
+    "ppo",
+    "recurrent_ppo",
+    "pid_tuned",
+    "pid_scheduled",
+)
+LEVELS = ("one_policy", "mpc", "minimum_variance", "expert", "dynamic_programme")
+RUNS = {"hot": "hot start", "cloned": "from the clone", "scratch": "from scratch"}
 GRIDS = {  # of each group of conditions: title, label of the rows, label of the columns
     "model": ("mismatch of the model", "A, times", "B, times"),
     "noise": ("disturbance and observation noise", "disturbance, times", "observation noise, times"),
@@ -77,7 +89,7 @@ def budget_curves(curves: pd.DataFrame, levels: Mapping[str, float]) -> Figure:
     """
     figure = empty_figure(WIDTH, 4.4)
     axes = figure.subplots()
-    markers = "osv^D*"
+    markers = "osv^D*PX"
     names = [name for name in LEARNERS if name in set(curves["learner"])]
     for index, name in enumerate(names):
         spent = curves[curves["learner"] == name].groupby("episodes")["objective"]
@@ -131,25 +143,29 @@ def heat_maps(robustness: pd.DataFrame, group: str, controllers: Sequence[str]) 
 
 
 def regret_figure(episodes: pd.DataFrame) -> Figure:
-    """What exploring costs: the worst episode of each epoch beside the PID's, and the cumulative regret against the PID.
+    """What exploring costs beside the PID: the dip at the onset, the worst episode of each epoch, and the cumulative regret.
 
     Args:
         episodes: columns run, epoch, episode, objective, expert.
     """
-    words = {"hot": "hot start", "scratch": "from scratch"}
     figure = empty_figure(WIDTH, 3.8)
-    left, right = figure.subplots(1, 2)
+    dip, left, right = figure.subplots(1, 3)
     for index, (run, group) in enumerate(episodes.groupby("run", sort=False)):
-        style: dict[str, Any] = {"color": LOOP_COLOURS[index], "linestyle": KIND_STYLES[index]}
-        worst = group.groupby("epoch")[["objective", "expert"]].min()
-        left.plot(worst.index, worst["objective"], label=words[str(run)], marker="o", markersize=3, **style)
-        right.plot(group["episode"], (group["expert"] - group["objective"]).cumsum(), label=words[str(run)], **style)
-    left.plot(worst.index, worst["expert"], color=MUTED, linestyle=KIND_STYLES[2], label="PID, same disturbances")
-    left.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+        style: dict[str, Any] = {"color": LOOP_COLOURS[index], "linestyle": KIND_STYLES[index], "label": RUNS[str(run)]}
+        by_epoch = group.groupby("epoch")[["objective", "expert"]]
+        mean, worst = by_epoch.mean(), by_epoch.min()
+        dip.plot(mean.index, 100 * mean["objective"] / mean["expert"], marker="o", markersize=3, **style)
+        left.plot(worst.index, worst["objective"], marker="o", markersize=3, **style)
+        right.plot(group["episode"], (group["expert"] - group["objective"]).cumsum(), **style)
+    dip.axhline(100, color=MUTED, linestyle=KIND_STYLES[3])
+    left.plot(worst.index, worst["expert"], color=MUTED, linestyle=KIND_STYLES[3], label="PID, same disturbances")
+    for axes in (dip, left):
+        axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+    dip.set(xlabel="epoch", ylabel="mean $J$ of the exploring\nepisodes (% of the PID's)")
     left.set(xlabel="epoch", ylabel="$J$ of the worst episode (no unit)")
     right.set(xlabel="plant episode", ylabel="cumulative regret\nagainst the PID (no unit)")
-    for axes, letter, name in ((left, "A", "worst episode"), (right, "B", "regret")):
+    for axes, letter, name in ((dip, "A", "dip at the onset"), (left, "B", "worst episode"), (right, "C", "regret")):
         axes.set_title(f"$\\mathbf{{{letter}}}$  {name[:1].upper()}{name[1:]}", loc="left")
         axes.set_label(f"{letter} {name}")
-    figure.legend(handles=left.lines, loc="outside lower center", ncols=3, frameon=False)
+    figure.legend(handles=left.lines, loc="outside lower center", ncols=4, frameon=False)
     return figure

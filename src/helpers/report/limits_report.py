@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 from helpers.report import scorecard
 from helpers.report.collection import Results
 from helpers.report.limits_answer import NO_LEARNERS, WITH_MODEL, answer
-from helpers.report.limits_figures import GRIDS, LABELS, LEARNERS, budget_curves, gap_figure, heat_maps
+from helpers.report.limits_figures import GRIDS, LABELS, LEARNERS, RUNS, budget_curves, gap_figure, heat_maps
 from helpers.report.statistics import FEWEST, median_interval
 from helpers.report.tables import NOT_KNOWN, ROMAN, spread, symbol
 from helpers.settings.paper import Params
@@ -51,9 +51,8 @@ SAFETY = {  # of the online epochs, with their units
 GROUPS = {"model": "model", "noise": "noise", "set_point": "set points", "time": "dead time and load"}
 THE_PAPERS = "irl_reinforce"
 RIVALS = tuple(name for name in LEARNERS if name != THE_PAPERS)  # they need no model
-RUNS = {"hot": "hot start", "scratch": "from scratch"}
 TUNED = 1.05  # of the objective it began with, for a search to have found other gains
-END_IN_REINFORCE = ("online", "irl_reinforce", "clone_reinforce", "scratch_reinforce")
+END_IN_REINFORCE = ("online", "irl_reinforce", "clone_reinforce", "csil_reinforce", "scratch_reinforce")
 
 
 def read(results: Results, part: str, name: str) -> pd.DataFrame:
@@ -508,7 +507,8 @@ def _answer_over_seeds(own: pd.DataFrame, listed: pd.DataFrame) -> str:
         passed = [LABELS[name] for name in learners if _low(learners[name] - reached["mpc"]) > 0]
         passing.append(f"after {episodes:,} {', '.join(passed) or 'none'}")
     medians = own.groupby("controller")[["objective", "gap"]].median()
-    known = ", ".join(f"{LABELS[name]} {medians['objective'][name]:.1f} ({medians['gap'][name]:.1f} %)" for name in WITH_MODEL)
+    model = medians.reindex(WITH_MODEL).dropna()
+    known = ", ".join(f"{LABELS[name]} {row['objective']:.1f} ({row['gap']:.1f} %)" for name, row in model.iterrows())
     return (
         f"**Learning on the plant**, best in the median: {'; '.join(best)}. **With the exact model** and no episode at all (in "
         f"brackets the gap to the programme): {known}; the demonstrator stands {medians['gap']['expert']:.1f} % below it. "

@@ -64,9 +64,14 @@ class Stage:
         return frame
 
     def policy(self, params: LearningParams, task: ControlTask) -> LSTMPolicy:
-        """The stage's policy, loaded without executing code, in the number type of the task."""
-        path = self.path("policy.safetensors")
+        """The stage's policy, in the number type of the task."""
         policy = LSTMPolicy(params.policy, len(task.set_point), len(task.input_low)).to(task.set_point.dtype)
+        self.into(policy)
+        return policy
+
+    def into(self, policy: nn.Module) -> None:
+        """Put the parameters of the stage's policy into a policy of its kind, without executing code."""
+        path = self.path("policy.safetensors")
         expected = policy.state_dict()
         try:
             found = load_tensors(path.read_bytes())
@@ -80,8 +85,7 @@ class Stage:
                 )
             if not found[name].isfinite().all():
                 raise ArtifactError(f"{path}: key '{name}': expected finite numbers; run the stage again")
-        policy.load_state_dict({name: tensor.to(task.set_point.dtype) for name, tensor in found.items()})
-        return policy
+        policy.load_state_dict(found)  # in the number type of the policy
 
 
 def save_stage(

@@ -28,7 +28,7 @@ OF_ALL_CASES = ("00_inferred_settings", "05_report", "09_one_policy")
 MORE_FILES = {
     "00_inferred_settings": ("identification", "published"),
     "05_report": ("published", "claims", "trials"),
-    "06_limits_and_alternatives": ("experiments", "limits"),
+    "06_limits_and_alternatives": ("experiments", "limits", "one_policy", "published"),
     "07_your_own_process": ("nonlinear_tank", "own_plant"),
     "08_claims": ("experiments", "published"),
     "09_one_policy": ("limits", "one_policy", "published"),

@@ -23,7 +23,8 @@ def make_inputs() -> None:
     with tempfile.TemporaryDirectory() as folder:
         config = ["seeds=1", "scale=smoke", f"results={folder}/results", f"reports={folder}/report"]
         snakemake = [sys.executable, "-m", "snakemake", "--profile", "profiles/local", "--cores", str(os.cpu_count()), "--nolock"]
-        subprocess.run([*snakemake, "--config", *config], cwd=PROJECT, check=True)
+        more = f"{folder}/results/smoke/seed_0/case_1/one_policy/record.json"  # notebook 06 reads it
+        subprocess.run([*snakemake, "--config", *config, "--", "all", more], cwd=PROJECT, check=True)
         shutil.rmtree(INPUTS, ignore_errors=True)
         shutil.copytree(Path(folder) / "results", INPUTS, ignore=shutil.ignore_patterns("notebooks"))
 

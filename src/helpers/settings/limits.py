@@ -54,10 +54,12 @@ class LibraryParams(Record):
 
 
 class TuningParams(Record):
-    """Tuning the gains of a PID on the real objective."""
+    """Tuning the gains of a PID, or a network that schedules them, on the real objective."""
 
     episodes: Annotated[Count, Leaf("episodes a candidate")]
-    initial_step: Annotated[Positive, Leaf("share of the gains")]
+    initial_step: Annotated[Positive, Leaf("ln of the gains")]
+    integral_factors: Annotated[tuple[Positive, ...], Several, Leaf("share of the integral action")]
+    cells: Annotated[Count, Leaf("cells")]
     derivative_unit: Annotated[Positive, Leaf("proportional gain times sampling time")]
 
 

@@ -153,6 +153,7 @@ class LearnerParams(Record):
     averaging: Annotated[Memory, Leaf("-")]
     patience: Annotated[int, Strict(), Field(ge=0), Leaf("epochs")]
     entropy: Annotated[NotNegative, Leaf("-")] = 0.0
+    critic: Annotated[NotNegative, Field(le=1), Leaf("share of the gradient")] = 0.0
 
 
 class WeightParams(Record):

@@ -21,6 +21,7 @@ from helpers.runs.opening import IdentificationSession
 from helpers.settings.paper import Params
 
 FINAL_TOLERANCE = 1.0e-7
+READING_TOLERANCE = 1.0e-3
 TWO_SIDED = ("T_E",)  # inputs whose bounds are fitted side by side; PID1 never meets the upper bound of the other
 
 
@@ -111,9 +112,9 @@ class Fitting:
         return self._fitted(problem, partial(refit, problem, values, self.session.scale_params), tuple(values.items()))
 
     def polish(self, problem: Problem, values: Values) -> Fit:
-        """The fit in the valley of given settings."""
+        """The fit in the valley of given settings, to a thousandth of its loss."""
         scale = self.session.scale_params
-        polished = partial(polish, problem, problem.position(values), scale.iterations, scale.draws)
+        polished = partial(polish, problem, problem.position(values), scale.iterations, scale.draws, READING_TOLERANCE)
         return self._fitted(problem, polished, "polish", tuple(values.items()))
 
     def profile(self, problem: Problem, best: Fit, key: Key, rise: float) -> Profile:

@@ -10,7 +10,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from helpers.evidence.identification import Fit, Problem, Profile, polish, profile, refit, search, steps
-from helpers.evidence.readings import GAINS, MAIN, TIME, FinerProcess, Reading, exact_drift, simulate, with_settings
+from helpers.evidence.readings import GAINS, MAIN, READINGS, TIME, Reading, ReadProcess, exact_drift, simulate, with_settings
 from helpers.learning.features import FeatureMap
 from helpers.plant.controllers import PID
 from helpers.plant.process import LinearProcess
@@ -89,7 +89,7 @@ def test_finer_steps_keep_the_mean_of_the_exact_drift_and_spread_as_an_integral(
     a, b, d, dt, x0, u0 = -4.0, 0.5, 0.5, 0.04, 1.0, 20.0
     update = {"drift_state": ((a, 0.0), (0.0, a)), "drift_input": ((b, 0.0), (0.0, b)), "disturbance": (d, d), "sampling_time": dt}
     generator = torch.Generator().manual_seed(0)
-    finer = FinerProcess(FIRST.process.model_copy(update=update), 16, generator)
+    finer = ReadProcess(FIRST.process.model_copy(update=update), Reading(substeps=16), generator)
     ones = torch.ones(200_000, 2, dtype=torch.float64)
     x = finer.step(x0 * ones, u0 * ones, torch.randn(ones.shape, generator=generator, dtype=torch.float64))
     moments = solve_ivp(
@@ -111,39 +111,118 @@ def test_the_error_of_the_initial_state_takes_the_place_of_the_number():
     torch.testing.assert_close(own[:, 4:] - given[:, 4:], (FIRST.features.initial_error - first) / FIRST.process.sampling_time)
 
 
-def one_loop_by_hand(n_steps, conditional, from_zero):
-    """Commands of the T loop of case 1 in plain floats, without noise, both loops simulated."""
+def one_loop_by_hand(n_steps, reading):
+    """Commands of both loops of case 1 in plain floats, without noise."""
     process, gains, target = FIRST.process, FIRST.demonstrator, FIRST.case.set_point
     A, B, dt = np.array(process.drift_state), np.array(process.drift_input), process.sampling_time
-    x, total, before, commands = np.zeros(2), np.zeros(2), np.zeros(2) if from_zero else None, []
+    x, total, commands = np.zeros(2), np.zeros(2), []
+    before = np.zeros(2) if reading.derivative_from_zero else None
     kp, ki, kd = (np.array(getattr(gains, kind)) for kind in GAINS)
+    last = np.array(target) - x
     for _ in range(n_steps):
-        error = np.array(target) - x
+        error, last = (last if reading.delay else np.array(target) - x), np.array(target) - x
         tried = total + error * dt
-        rate = 0.0 if before is None else (error - before) / dt
-        command = kp * error + ki * tried + kd * rate
+        if reading.bounded_integral:
+            tried = np.clip(ki * tried, process.input_low, process.input_high) / ki
+        seen = tried - (1 - reading.present_error) * error * dt
+        smooth = error if before is None else reading.error_memory * before + (1 - reading.error_memory) * error
+        rate = 0.0 if before is None else (smooth - before) / dt
+        command = kp * error + ki * seen + kd * rate
         u = np.clip(command, process.input_low, process.input_high)
-        frozen = (u != command) & (np.sign(error) == np.sign(command)) if conditional else np.zeros(2, dtype=bool)
-        total, before = np.where(frozen, total, tried), error
+        frozen = (u != command) & (np.sign(error) == np.sign(command)) & reading.conditional_integration
+        total, before = np.where(frozen, total, tried), smooth
         commands.append(command)
         x = x + (A @ x + B @ u) * dt
     return np.array(commands)
 
 
-@pytest.mark.parametrize(("conditional", "from_zero"), [(False, False), (True, False), (False, True)])
-def test_the_pid_of_a_reading_without_noise(conditional, from_zero, monkeypatch):
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"conditional_integration": True},
+        {"derivative_from_zero": True},
+        {"bounded_integral": True},
+        {"present_error": 0.5},
+        {"error_memory": 0.5},
+        {"delay": True},
+    ],
+)
+def test_the_pid_of_a_reading_without_noise(changes, monkeypatch):
     process = FIRST.process.model_copy(update={"observation_noise": (0.0, 0.0), "disturbance": (0.0, 0.0)})
     calm = replace(FIRST, process=process, case=FIRST.case.model_copy(update={"initial_std": (0.0, 0.0)}))
-    seen = []
+    seen, reading = [], Reading(first_error=None, **changes)
 
     def watched(*arguments):
         seen.append(rollout(*arguments))
         return seen[-1]
 
     monkeypatch.setattr("helpers.evidence.readings.rollout", watched)
-    simulate(calm, {}, Reading(first_error=None, conditional_integration=conditional, derivative_from_zero=from_zero), 2, draws())
-    expected = one_loop_by_hand(seen[0].n_steps, conditional, from_zero)
+    simulate(calm, {}, reading, 2, draws())
+    expected = one_loop_by_hand(seen[0].n_steps, reading)
     np.testing.assert_allclose(seen[0].command[:, 0].numpy(), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, lambda x, z, s, w, dt: z + x * s * w),
+        ({"disturbance": "behind"}, lambda x, z, s, w, dt: z * (1 + s * w)),
+        ({"disturbance": "once"}, lambda x, z, s, w, dt: z * (1 + s * w)),
+        ({"disturbance": "milstein"}, lambda x, z, s, w, dt: z + x * (s * w + s**2 * (w**2 - 1) / 2)),
+        ({"disturbance_power": 1.0}, lambda x, z, s, w, dt: z + x * s * w * dt**0.5),
+        ({"one_disturbance": True}, lambda x, z, s, w, dt: z + x * s * w[0]),
+    ],
+)
+def test_one_step_of_a_reading_by_hand(changes, expected):
+    process = FIRST.process
+    A, B, dt = np.array(process.drift_state), np.array(process.drift_input), process.sampling_time
+    x, u, w = np.array([0.7, -1.3]), np.array([9.0, -31.0]), np.array([0.4, -1.7])
+    found = ReadProcess(process, Reading(**changes), torch.Generator()).step(*(torch.tensor(v)[None] for v in (x, u, w)))[0]
+    spread = np.array(process.disturbance) * dt**0.5
+    np.testing.assert_allclose(found.numpy(), expected(x, x + (A @ x + B @ u) * dt, spread, w, dt), rtol=1e-12)
+
+
+def test_the_disturbance_of_several_steps_comes_once_at_the_end_and_as_wide():
+    generator = torch.Generator().manual_seed(0)
+    x, still = torch.ones(100_000, 2, dtype=torch.float64), torch.zeros(100_000, 2, dtype=torch.float64)
+    mean = ReadProcess(FIRST.process.model_copy(update={"disturbance": (0.0, 0.0)}), Reading(substeps=4), generator).step(
+        x, x, still
+    )
+    found = ReadProcess(FIRST.process, Reading(substeps=4, disturbance="once"), generator).step(x, x, still)
+    expected = np.array(FIRST.process.disturbance) * FIRST.process.sampling_time**0.5
+    np.testing.assert_allclose((found / mean - 1).std(0).numpy(), expected, rtol=2e-2)
+
+
+def test_what_the_controller_sees_and_what_the_types_are_taken_of():
+    x, noise = torch.ones(4, 2, dtype=torch.float64), torch.ones(4, 2, dtype=torch.float64)
+    seen = {
+        name: ReadProcess(FIRST.process, Reading(**{name: True}), torch.Generator()) for name in ("acts_on_state", "observed_state")
+    }
+    assert all(process.observe(x, noise).equal(x) for process in seen.values())
+    after = [process.step(x, x, torch.zeros_like(x)) for process in seen.values()]
+    assert (after[1] / after[0] - 1).abs().min() > 0
+    of = {
+        name: simulate(FIRST, {}, reading, 40, draws()).v
+        for name, reading in (
+            ("x", MAIN),
+            ("y", Reading(features_on="y")),
+            ("II", Reading(accumulated_on="y")),
+            ("III", Reading(rate_on="y")),
+        )
+    }
+    assert of["II"].equal(torch.cat([of["x"][:, :2], of["y"][:, 2:4], of["x"][:, 4:]], 1))
+    assert of["III"].equal(torch.cat([of["x"][:, :4], of["y"][:, 4:]], 1))
+    assert with_settings(FIRST, {}, Reading(samples=49)).process.horizon == 49
+
+
+def test_the_readings_are_many_and_differ():
+    assert (
+        len({replace(reading, name="") for reading in READINGS})
+        == len({reading.name for reading in READINGS})
+        == len(READINGS)
+        >= 30
+    )
 
 
 def test_an_unstable_loop_costs_much_and_stays_finite():

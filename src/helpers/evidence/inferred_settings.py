@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.stats import chi2
 
 from helpers.evidence.identification import Fit, Problem, Profile, fit, polish, profile, refit
 from helpers.evidence.readings import GAINS, MAIN, READINGS, TIME, Key, Reading, Values, Vector, simulate
@@ -20,6 +21,7 @@ from helpers.runs.opening import IdentificationSession
 from helpers.settings.paper import Params
 
 FINAL_TOLERANCE = 1.0e-7
+READING_TOLERANCE = 1.0e-3
 TWO_SIDED = ("T_E",)  # inputs whose bounds are fitted side by side; PID1 never meets the upper bound of the other
 
 
@@ -109,6 +111,12 @@ class Fitting:
         """The fit in reach of given settings."""
         return self._fitted(problem, partial(refit, problem, values, self.session.scale_params), tuple(values.items()))
 
+    def polish(self, problem: Problem, values: Values) -> Fit:
+        """The fit in the valley of given settings, to a thousandth of its loss."""
+        scale = self.session.scale_params
+        polished = partial(polish, problem, problem.position(values), scale.iterations, scale.draws, READING_TOLERANCE)
+        return self._fitted(problem, polished, "polish", tuple(values.items()))
+
     def profile(self, problem: Problem, best: Fit, key: Key, rise: float) -> Profile:
         """The profile of one setting about the fit of a problem."""
 
@@ -193,10 +201,11 @@ def fits_table(fits: Mapping[str, Sequence[Fit]]) -> pd.DataFrame:
 
 
 def compare_readings(study: Fitting, joint: Fit, second: Fit) -> pd.DataFrame:
-    """Every reading at its own best settings. Columns: reading; loss and mean relative error by table; then the settings shared.
+    """Every reading at its own best settings. Columns: reading; loss and mean relative error by table; then the settings.
 
-    The first demonstrator is fitted with sampling time and bounds, the second at those. A reading may change the sampling errors
-    s of the rows: its loss then counts 2 log(s / s of the main reading) for every row, as a normal likelihood does.
+    The first demonstrator is fitted with sampling time and bounds, the second at those, both by least squares from the best fit of
+    the first reading, and judged on fresh trajectories. A reading may change the sampling errors s of the rows: its loss then
+    counts 2 log(s / s of the first reading) for every row, as a normal likelihood does.
     """
     session, scale, manipulated = study.session, study.session.scale_params, study.any_params.process.manipulated
     start = {**study.filed(study.first), **joint.settings}
@@ -204,21 +213,31 @@ def compare_readings(study: Fitting, joint: Fit, second: Fit) -> pd.DataFrame:
     for reading in READINGS[: scale.readings]:
         errors = sampling_errors(session, reading)
         problem = replace(study.problem(study.first, shared=True, reading=reading), sampling_error=errors)
-        found = study.refit(problem, start)
+        found = study.polish(problem, start)
         shared = {key: value for key, value in found.settings.items() if key[0] not in GAINS}
         other = replace(study.problem(study.second, reading=reading), fixed=shared, sampling_error=errors)
         row: dict[str, object] = {"reading": reading.name}
-        for target, best in ((problem, found), (other, study.refit(other, second.settings))):
-            tables = [study.compared(case, best.settings, scale.draws, "readings", reading) for case in target.cases]
+        for target, best in ((problem, found), (other, study.polish(other, second.settings))):
+            tables = [
+                study.compared(case, best.settings, scale.fresh, "readings", reading).assign(error=errors[case])
+                for case in target.cases
+            ]
+            loss = sum((((t["simulated"] - t["published"]) / t["error"]) ** 2).sum() for t in tables)
             wider = sum(2 * np.log(errors[case] / study.sampling_error[case]).sum() for case in target.cases)
-            row["loss_" + "_".join(str(session.published[case].table) for case in target.cases)] = best.loss + wider
+            row["loss_" + "_".join(str(session.published[case].table) for case in target.cases)] = loss + wider
             row |= {f"error_{table['table'].iloc[0]}": table["relative_error"].abs().mean() for table in tables}
         row["sampling_time"] = shared[TIME]
         for name in manipulated:
             bound = shared.get(("input_bound", name), np.nan)
             row |= {f"low {name}": shared.get(("input_low", name), -bound), f"high {name}": shared.get(("input_high", name), bound)}
-        rows.append(row)
+        rows.append(row | {f"{study.first} {kind} {loop}": found.settings[kind, loop] for kind, loop in study.gain_ends()})
     return pd.DataFrame(rows)
+
+
+def chance(study: Fitting, joint: Fit) -> float:
+    """The loss that chance exceeds once in twenty, were a reading the authors' own: chi-square, the rows less the settings."""
+    rows = sum(len(study.sampling_error[case]) for case in study.cases(study.first))
+    return float(chi2.ppf(0.95, rows - len(joint.settings)))
 
 
 def dispersion(study: Fitting, joint: Fit, second: Fit) -> float:

@@ -33,21 +33,45 @@ class Reading:
         first_error: |e| before the first step: a number, or "own" for the error of each initial state. Its mean is one, so that
             the number one, which the files hold, gives the same features, but with a smaller spread of Type III.
         conditional_integration: the integral stands still while the command lies outside the bounds and would move further out.
+        bounded_integral: the term of the integral is kept inside the bounds.
+        present_error: share of the present error in the integral: one half by the trapezoidal rule, from no error before.
         derivative_from_zero: the first sample has a derivative, of an error that was zero before.
-        exact_drift: the drift is integrated exactly between two samples, not by one Euler step; the disturbance is not.
+        error_memory: share of the last filtered error in the next one, which the derivative is taken of.
+        delay: the controller acts on the sample before.
+        acts_on_state: the controller meets no observation noise.
+        exact_drift: the drift is integrated exactly between two steps, not by Euler's rule; the disturbance is not.
         substeps: Euler-Maruyama steps between two samples.
+        disturbance: "along" for every step, of the state before it; "behind" for every step, of the state behind its drift;
+            "once" for a sample, of the state at its end; "milstein" for Milstein's rule.
+        disturbance_power: the power of the step that scales the disturbance.
+        one_disturbance: both states meet the same Wiener process.
+        observed_state: the noise of the observation stays in the state.
+        accumulated_on, rate_on: the signal of Type II and of Type III, where it is another than that of Type I.
+        samples: the horizon.
     """
 
     name: str = "as in the parameter files"
     first_error: float | str | None = "own"
     conditional_integration: bool = False
+    bounded_integral: bool = False
+    present_error: float = 1.0
     derivative_from_zero: bool = False
+    error_memory: float = 0.0
+    delay: bool = False
+    acts_on_state: bool = False
     noise_as_variance: bool = False
     start_as_variance: bool = False
     symmetric_bounds: bool = False
     exact_drift: bool = False
     substeps: int = 1
+    disturbance: str = "along"
+    disturbance_power: float = 0.5
+    one_disturbance: bool = False
+    observed_state: bool = False
     features_on: str | None = None
+    accumulated_on: str | None = None
+    rate_on: str | None = None
+    samples: int | None = None
 
 
 MAIN = Reading()
@@ -56,23 +80,49 @@ READINGS = (
     Reading("|e| before the first step is 1", first_error=1.0),
     Reading("|e| before the first step is 0", first_error=0.0),
     Reading("conditional integration", conditional_integration=True),
+    Reading("integral kept inside the bounds", bounded_integral=True),
+    Reading("integral without the present error", present_error=0.0),
+    Reading("trapezoidal integral", present_error=0.5),
     Reading("derivative at the first sample", derivative_from_zero=True),
+    Reading("derivative of a filtered error", error_memory=0.5),
+    Reading("controller acts on the sample before", delay=True),
+    Reading("controller acts on x", acts_on_state=True),
     Reading("observation noise is a variance", noise_as_variance=True),
+    Reading("observation noise stays in the state", observed_state=True),
     Reading("spread of the initial state is a variance", start_as_variance=True),
-    Reading("features on y", features_on="y"),
     Reading("bounds as wide downwards as upwards", symmetric_bounds=True),
-    Reading("drift integrated exactly", exact_drift=True),
-    Reading("four Euler-Maruyama steps a sample", substeps=4),
+    Reading("features on y", features_on="y"),
+    Reading("Type II on y", accumulated_on="y"),
+    Reading("Type III on y", rate_on="y"),
+    Reading("49 samples", samples=49),
+    Reading("51 samples", samples=51),
+    Reading("exact drift, noise of the state before it", exact_drift=True),
+    Reading("exact drift, noise once at the end", exact_drift=True, disturbance="once"),
+    Reading("exact drift, noise along the way", exact_drift=True, substeps=8),
+    Reading("noise of the state behind the drift", disturbance="behind"),
+    Reading("Milstein's rule", disturbance="milstein"),
+    Reading("noise scaled by the step, not its root", disturbance_power=1.0),
+    Reading("one Wiener process for both states", one_disturbance=True),
+    *(Reading(f"{number} steps a sample", substeps=number) for number in (2, 4, 5, 8, 10, 20)),
+    Reading("4 steps, noise once at the end", substeps=4, disturbance="once"),
+    Reading("4 steps, controller acts on x", substeps=4, acts_on_state=True),
+    Reading("4 steps, integral without the present error", substeps=4, present_error=0.0),
+    Reading("4 steps, one Wiener process", substeps=4, one_disturbance=True),
+    Reading("4 steps, spread of the initial state is a variance", substeps=4, start_as_variance=True),
+    Reading("4 steps, Type III on y", substeps=4, rate_on="y"),
+    Reading("4 steps, features on y", substeps=4, features_on="y"),
+    Reading("4 steps, 51 samples", substeps=4, samples=51),
 )
 
 
 class ReadPID(PID):
-    """The PID under another reading."""
+    """The PID under another reading; it serves one rollout."""
 
     def __init__(self, gains: GainParams, task: ControlTask, sampling_time: float, reading: Reading) -> None:
         super().__init__(gains, task.set_point, sampling_time)
         self.task = task
         self.reading = reading
+        self.seen: Tensor | None = None
 
     def start(self, n_trajectories: int, n_steps: int, generator: torch.Generator) -> PIDMemory:
         """No accumulated error; the error before the first sample is zero or unknown."""
@@ -81,31 +131,58 @@ class ReadPID(PID):
 
     def act(self, observation: Tensor, memory: PIDMemory) -> tuple[Tensor, PIDMemory]:
         """The PID law at one sample."""
+        if self.reading.delay:
+            observation, self.seen = observation if self.seen is None else self.seen, observation
         command, after = super().act(observation, memory)
+        error = self.set_point - observation
+        command = command - (1 - self.reading.present_error) * self.integral * error * self.sampling_time
+        if self.reading.error_memory and memory.previous is not None:  # the filter moves the derivative's error, none of the others
+            lag = self.reading.error_memory * (error - memory.previous)
+            command = command - self.derivative * lag / self.sampling_time
+            after = replace(after, previous=error - lag)
         if self.reading.conditional_integration:
-            error = self.set_point - observation
             outward = ((command > self.task.input_high) & (error > 0)) | ((command < self.task.input_low) & (error < 0))
             after = replace(after, integral=torch.where(outward, memory.integral, after.integral))
+        if self.reading.bounded_integral:
+            term = self.integral * after.integral
+            kept = term.clamp(self.task.input_low, self.task.input_high)
+            command, after = command + kept - term, replace(after, integral=after.integral + (kept - term) / self.integral)
         return command, after
 
 
-class FinerProcess(LinearProcess):
-    """The process of Eq. 4.1.3 integrated in several Euler-Maruyama steps between two samples.
+class ReadProcess(LinearProcess):
+    """The process of Eq. 4.1.3 under another reading.
 
-    The noise handed in is that of the first of them; the others' comes from a generator of its own.
+    The noise handed in is that of the first step after a sample; that of further ones comes from a generator of its own.
     """
 
-    def __init__(self, params: ProcessParams, substeps: int, generator: torch.Generator) -> None:
-        super().__init__(params.model_copy(update={"sampling_time": params.sampling_time / substeps}), DTYPE)
-        self.substeps = substeps
+    def __init__(self, params: ProcessParams, reading: Reading, generator: torch.Generator) -> None:
+        step = params.model_copy(update={"sampling_time": params.sampling_time / reading.substeps})
+        super().__init__(exact_drift(step) if reading.exact_drift else step, DTYPE)
+        self.reading = reading
         self.generator = generator
+        self.spread = self.disturbance_gain * self.sampling_time**0.5
 
     def step(self, x: Tensor, u: Tensor, noise: Tensor) -> Tensor:
         """The state at the next sample."""
-        x = super().step(x, u, noise)
-        for _ in range(self.substeps - 1):
-            x = super().step(x, u, torch.randn(x.shape, generator=self.generator, dtype=DTYPE))
-        return x
+        reading, still = self.reading, torch.zeros_like(noise)
+        for substep in range(reading.substeps):
+            w = torch.randn(x.shape, generator=self.generator, dtype=DTYPE) if substep else noise
+            w = w[:, :1].expand_as(w) if reading.one_disturbance else w
+            if reading.disturbance == "milstein":
+                w = w + self.spread * (w**2 - 1) / 2
+            w = w * self.sampling_time ** (reading.disturbance_power - 0.5)
+            behind = reading.disturbance == "behind"
+            x = super().step(x, u, still if behind or reading.disturbance == "once" else w)
+            if behind:
+                x = x * (1 + self.spread * w)
+        if reading.disturbance == "once":
+            x = x * (1 + self.spread * reading.substeps**0.5 * w)
+        return super().observe(x, torch.randn(x.shape, generator=self.generator, dtype=DTYPE)) if reading.observed_state else x
+
+    def observe(self, x: Tensor, noise: Tensor) -> Tensor:
+        """What the controller acts on."""
+        return x if self.reading.observed_state or self.reading.acts_on_state else super().observe(x, noise)
 
 
 def exact_drift(process: ProcessParams) -> ProcessParams:
@@ -132,8 +209,8 @@ def with_settings(params: Params, values: Values, reading: Reading) -> Params:
     process = process.model_copy(update={"sampling_time": time, "input_low": tuple(low), "input_high": tuple(high)})
     if reading.noise_as_variance:
         process = process.model_copy(update={"observation_noise": tuple(s**0.5 for s in process.observation_noise)})
-    if reading.exact_drift:
-        process = exact_drift(process)
+    if reading.samples is not None:
+        process = process.model_copy(update={"horizon": reading.samples})
     if reading.start_as_variance:
         case = case.model_copy(update={"initial_std": tuple(s**0.5 for s in case.initial_std)})
     if reading.features_on is not None:
@@ -171,13 +248,14 @@ def simulate(params: Params, values: Values, reading: Reading, n_trajectories: i
     time = params.process.sampling_time
     features = FeatureMap(params.features, task, time)
     controller = ReadPID(params.demonstrator, task, time, reading)
-    process = LinearProcess(params.process, DTYPE)
-    if reading.substeps > 1:
-        process = FinerProcess(params.process, reading.substeps, torch.Generator().manual_seed(generator.initial_seed() + 1))
+    process = ReadProcess(params.process, reading, torch.Generator().manual_seed(generator.initial_seed() + 1))
     trajectories = rollout(process, controller, task, n_trajectories, generator)
-    v = features.trajectory(trajectories)
+    signals = [signal or params.features.features_on for signal in (None, reading.accumulated_on, reading.rate_on)]
+    v = {signal: features.on(signal).trajectory(trajectories) for signal in set(signals)}
+    by_type = [v[signal].chunk(3, dim=1)[kind] for kind, signal in enumerate(signals)]
     if reading.first_error == "own":
-        signal = trajectories.x if params.features.features_on == "x" else trajectories.y
-        first = normalised_error(signal[0], task.set_point, task.error_scale).abs()
-        v = torch.cat([v[:, : -first.shape[1]], v[:, -first.shape[1] :] - first / time], dim=1)
-    return Simulated(v, overshoot(normalised_error(trajectories.x.mean(1), task.set_point, task.error_scale)))
+        signal = trajectories.x if signals[-1] == "x" else trajectories.y
+        by_type[-1] = by_type[-1] - normalised_error(signal[0], task.set_point, task.error_scale).abs() / time
+    return Simulated(
+        torch.cat(by_type, dim=1), overshoot(normalised_error(trajectories.x.mean(1), task.set_point, task.error_scale))
+    )

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import torch
 
-from helpers.evidence import experiments
+from helpers.evidence import alternatives, experiments
 from helpers.evidence.experiments import attempt, first_epoch, prepare, response_figures
 from helpers.plant.task import Trajectories
 from helpers.runs.session import open_session
@@ -33,7 +33,7 @@ def test_response_figures_by_hand(prepared):
     dt = session.params.process.sampling_time
     expected = {
         "settling_time:C_A": 3 * dt,
-        "settling_time:T": 5 * dt,
+        "settling_time:T": session.task.n_steps * dt,
         "abs_offset:C_A": 0.025,
         "abs_offset:T": 0.65,
         "overshoot:C_A": 0.2,
@@ -125,7 +125,7 @@ def test_the_baseline_lowers_the_spread(prepared):
 
 def test_what_is_not_planned_is_not_run(prepared):
     run = prepared(3)
-    assert experiments.feature_sets(run) == {}
+    assert alternatives.feature_sets(run) == {}
     assert set(experiments.online_starts(run)[0]) == {"hot", "scratch", "scratch_dense"}
 
 

@@ -13,8 +13,8 @@ def read_of_seed(seed):
         stages += ["inferred_settings"] if seed == 0 else []
         stages += [f"case_{case}/{stage}" for case in CASES for stage in ("experiments", *(["limits_safety"] if seed in FEW else []))]
         stages += ["case_1/one_policy"] if seed in FEW else []
-        for trial in TRIALS if seed in FEW else ():
-            stages += [f"case_1/offline_{trial}", f"case_2/offline_{trial}", f"case_3/transfer_{trial}"]
+        for name, trial in TRIALS.items() if seed in FEW else ():
+            stages += [f"case_{case}/{'transfer' if case == 3 else 'offline'}_{name}" for case in trial.cases]
     return stages
 
 

@@ -17,7 +17,6 @@ def test_every_number_that_the_claims_ask_for_is_there(prepared, root, case):
     verbs = (
         experiments.responses,
         experiments.readings,
-        experiments.sharpness,
         experiments.transfer,
         experiments.frozen_weights,
         experiments.gradient_spread,

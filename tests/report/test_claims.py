@@ -1,14 +1,12 @@
 """Claims: the file, the rule of the verdict, and the numbers it is given."""
 
-import shutil
-
 import numpy as np
 import pandas as pd
 import pytest
 from ruamel.yaml import YAML
 
 from helpers.report.claims import COLUMNS, Claim, collect, judge, load_claims, verdicts
-from helpers.runs.artifacts import ArtifactError, save_stage
+from helpers.runs.artifacts import load_stage, save_stage
 from helpers.runs.request import PROJECT
 from helpers.settings.leaf import ParameterError
 
@@ -39,8 +37,9 @@ def test_the_committed_claims(root):
 def test_every_number_of_the_ordinary_stages_is_one_that_they_write(root):
     """Those of notebook 08 are checked with its verbs, in test_experiments."""
     claims = load_claims(root)
-    found = collect(claims, PROJECT / "notebooks/inputs", "smoke", [0])
-    known = set(zip(found["case"], found["quantity"], strict=True))
+    folders = (PROJECT / "notebooks/inputs/smoke/seed_0").glob("case_*/*_*")
+    stages = {(int(folder.parent.name[-1]), 0, folder.name): load_stage(folder, "refresh") for folder in folders}
+    known = set(collect(claims, stages).index)
     for name, entry in claims.items():
         for quantity in entry.quantities.values():
             for reference in (quantity.value, quantity.against):
@@ -54,7 +53,8 @@ def test_every_number_of_the_ordinary_stages_is_one_that_they_write(root):
         ({"margin": None}, "key 'hot_start': the test 'difference_below' needs 'margin' and 'quantities'"),
         ({"test": "larger"}, "key 'hot_start.test'"),
         ({"test": "value_below"}, "key 'hot_start': the test 'value_below' needs no 'against'"),
-        ({"test": "not_comparable"}, "key 'hot_start': a claim that is not comparable has neither"),
+        ({"test": "not_comparable"}, "key 'hot_start': the test 'not_comparable' has neither 'margin' nor 'quantities'"),
+        ({"changed": "because"}, "key 'hot_start.changed'"),
         ({"cases": []}, "key 'hot_start.cases'"),
         ({"margins": 1}, "key 'hot_start.margins': the key is unknown"),
         ({"section": 3.3}, "key 'hot_start.section'"),
@@ -118,52 +118,54 @@ def test_seeds_are_compared_in_pairs():
     assert found.ci_low <= found.median <= found.ci_high < 0
 
 
-def test_not_comparable_gives_its_reason():
-    found = judge(claim("not_comparable", margin=None, quantities={}), paired([]))
-    assert (found.verdict, found.reason, found.n) == ("not comparable", "because", 0)
+@pytest.mark.parametrize(("test", "verdict"), [("not_comparable", "not comparable"), ("by_definition", "holds")])
+def test_what_no_number_decides_gives_its_reason(test, verdict):
+    found = judge(claim(test, margin=None, quantities={}), paired([]))
+    assert (found.verdict, found.reason, found.n) == (verdict, "because", 0)
+
+
+def test_a_failure_of_settings_of_ours_cannot_tell():
+    values = paired([1, 2, 3, 4, 5])
+    assert judge(claim(), values).verdict == "does not hold"
+    found = judge(claim(one_sided=True), values)
+    assert (found.verdict, found.reason) == ("cannot tell", "no part of the interval lies below 0, with settings of ours")
+    assert judge(claim("difference_above", one_sided=True), values).verdict == "holds"
 
 
 # The numbers
 
 
 @pytest.fixture
-def results(tmp_path):
+def stages(tmp_path):
     """Six seeds of a stage with two numbers, written in different orders; the fourth lacks one of them."""
     for seed in range(6):
         rows = [("r", "m", 1.0 * seed), ("r", "n", 1.0 * seed + 1), ("r", "unasked", 0.0)][:: 1 if seed % 2 else -1]
         rows = [row for row in rows if seed != 4 or row[1] != "n"]
         frame = pd.DataFrame(rows, columns=["stage", "metric", "value"])
-        save_stage(tmp_path / f"paper/seed_{seed}/case_1/s", {}, {"scores.csv": frame})
-    return tmp_path
+        save_stage(tmp_path / str(seed), {}, {"scores.csv": frame})
+    return {(1, seed, "s"): load_stage(tmp_path / str(seed), "a test") for seed in range(6)}
 
 
-def test_from_files_to_verdicts(results):
+def test_from_files_to_verdicts(stages):
     claims = {
-        "less": claim(),
+        "less": claim(changed="2026-11-29: as it was"),
         "elsewhere": claim(cases=(2,)),
         "never": claim(quantities={"x": {"value": "t/r/m", "against": "t/r/n"}}),
         "silent": claim("not_comparable", margin=None, quantities={}),
     }
-    values = collect(claims, results, "paper", range(6))
-    assert set(values["quantity"]) == {"s/r/m", "s/r/n"}
-    assert len(values) == 11
+    values = collect(claims, stages)
+    assert values.index.tolist() == [(1, "s/r/m"), (1, "s/r/n")]
+    assert values.notna().to_numpy().sum() == 11
     table = verdicts(claims, values)
-    assert tuple(table.columns) == COLUMNS
+    assert table.columns.tolist() == COLUMNS
+    assert table["changed"].tolist() == ["2026-11-29: as it was", "", "", ""]
     assert table["verdict"].tolist() == ["holds", "cannot tell", "cannot tell", "not comparable"]
     assert table["reason"].tolist() == ["the whole interval lies below 0", "not run", "not run", "because"]
     first = table.iloc[0]
     assert (first["n"], first["median"], first["test"], first["quantity"]) == (5, -1.0, "difference below 0", "two")
 
 
-def test_nothing_run_at_all(tmp_path):
+def test_nothing_run_at_all():
     claims = {"less": claim()}
-    table = verdicts(claims, collect(claims, tmp_path, "paper", [0]))
+    table = verdicts(claims, collect(claims, {}))
     assert table[["n", "verdict", "reason"]].to_numpy().tolist() == [[0, "cannot tell", "not run"]]
-
-
-def test_a_changed_result_is_refused(results):
-    (results / "paper/seed_1/case_1/s/scores.csv").write_text("stage,metric,value\nr,m,0\n", encoding="utf-8")
-    with pytest.raises(ArtifactError, match="has changed since it was written"):
-        collect({"less": claim()}, results, "paper", range(6))
-    shutil.rmtree(results / "paper/seed_1")
-    assert collect({"less": claim()}, results, "paper", range(6))["seed"].nunique() == 5

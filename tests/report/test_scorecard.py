@@ -60,7 +60,7 @@ def compare(runs: pd.DataFrame, published=None, names=None) -> pd.DataFrame:
         (10.0, 7.49, 12.51, "cannot tell", "one run scatters by 2.5 to either side of 10.00"),
         (-10.0, -12.51, -7.49, "cannot tell", "one run scatters by 2.5 to either side of -10.00"),
         (-10.0, -12.5, -7.5, "match", "inside -12.50 to -7.50"),
-        (10.0, 12.0, 17.2, "cannot tell", "one run scatters by 2.6 to either side of 14.60"),  # outside, but too wide
+        (10.0, 12.0, 17.2, "differs", "2 below the interval"),  # outside tells, however wide
     ],
 )
 def test_the_verdict_and_its_reason(published, low, high, expected, reason):

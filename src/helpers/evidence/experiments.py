@@ -5,7 +5,7 @@ whose experiment is not planned for the session's case or seed (params/experimen
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -15,10 +15,11 @@ from torch import Tensor
 
 from helpers.learning.algorithm_1 import algorithm_1
 from helpers.learning.algorithm_2 import apprentice_reward
+from helpers.learning.control_quality import settling_time
 from helpers.learning.evaluation import feature_gap
 from helpers.learning.learner import TrainingError, baseline_regressors, discounted_return, regression_advantage, surrogate
 from helpers.learning.policy import LSTMPolicy, PolicyController
-from helpers.plant.controllers import Controller, SaturatedLQ
+from helpers.plant.controllers import SaturatedLQ
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
 from helpers.runs.finished import State
@@ -74,13 +75,6 @@ def prepare(session: Session) -> Prepared:
     )
 
 
-def plan(prepared: Prepared) -> pd.DataFrame:
-    """Which experiments are planned for which cases, and whether they are run in this one."""
-    planned = {name: entry for name, entry in vars(prepared.params).items() if isinstance(entry, ExperimentCases)}
-    rows = [(name.replace("_", " "), str(list(entry.cases)), prepared.planned(entry)) for name, entry in planned.items()]
-    return pd.DataFrame(rows, columns=["experiment", "cases", "run here"])
-
-
 def economical(session: Study) -> Study:
     """The session with fewer episodes an epoch, learned from and measured, for runs that nothing but a claim reads."""
     scale = session.scale_params
@@ -97,31 +91,29 @@ def gap_to(session: Study, trajectories: Trajectories, expert_features: Tensor) 
 
 
 def response_figures(session: Session, trajectories: Trajectories, comparison: ComparisonParams) -> dict[str, float]:
-    """Figures of the response that `judge` lacks, and two of its own in a form that is always a number.
+    """Figures of the response, in a form that is always a number; what the mean response never reaches takes the whole episode.
 
-    rise_time is that of `judge`, or the whole episode where the mean response never gets there; settling_time, after which it
-    stays within a band about the set point; abs_offset, the size of the mean error at the end; excess_travel, how much further
-    the mean response travels than from its start to its end, as a share of the set point change (nought without overshoot and
-    oscillation, up to noise); tail_error, the mean |e| over both loops at the end.
+    settling_time: after which it stays within a band about the set point; abs_offset: the size of the mean error at the end;
+    excess_travel: how much further the mean response travels than from its start to its end, as a share of the set point change
+    (nought without overshoot and oscillation, up to noise). The others are those of `judge`.
     """
-    figures = session.judge(trajectories)
-    error = session.features.errors(trajectories)
+    dt, error = session.params.process.sampling_time, session.features.errors(trajectories)
     mean = error.mean(1)
-    outside = (mean.abs() > comparison.band) * torch.arange(1, len(mean) + 1, dtype=mean.dtype)[:, None]
-    settled = outside.amax(0) * session.params.process.sampling_time
-    travel = mean.diff(dim=0).abs().sum(0) - (mean[-1] - mean[0]).abs()
-    episode = session.task.n_steps * session.params.process.sampling_time
-    tail = error[-comparison.n_last :]
-    rows = {"objective_x": figures["objective_x"], "tail_error": tail.abs().mean().item()}
-    loops, of_loops = session.params.process.controlled, torch.stack([settled, tail.mean((0, 1)).abs(), travel], dim=1)
-    for loop, (settling, offset, extra) in zip(loops, of_loops.tolist(), strict=True):
-        rise = figures[f"rise_time:{loop}"]
-        rows[f"rise_time:{loop}"] = episode if math.isnan(rise) else rise
-        rows[f"settling_time:{loop}"] = settling
-        rows[f"abs_offset:{loop}"] = offset
-        rows[f"overshoot:{loop}"] = figures[f"overshoot:{loop}"]
-        rows[f"excess_travel:{loop}"] = extra
-    return rows
+    of_loops = {
+        "settling_time": settling_time(mean, dt, comparison.band),
+        "abs_offset": error[-comparison.n_last :].mean((0, 1)).abs(),
+        "excess_travel": mean.diff(dim=0).abs().sum(0) - (mean[-1] - mean[0]).abs(),
+    }
+    judged = session.judge(trajectories).items()
+    rows = {name: value for name, value in judged if name.startswith(("objective_x", "rise_time:", "overshoot:"))}
+    rows |= by_loop(session, of_loops)
+    return {name: session.task.n_steps * dt if math.isnan(value) else value for name, value in rows.items()}
+
+
+def by_loop(session: Study, figures: Mapping[str, Tensor]) -> dict[str, float]:
+    """Figures of shape (n_y,) as single numbers, <name>:<controlled variable>."""
+    loops = session.params.process.controlled
+    return {f"{name}:{loop}": value for name, of in figures.items() for loop, value in zip(loops, of.tolist(), strict=True)}
 
 
 def predictive(prepared: Prepared) -> SaturatedLQ:
@@ -131,45 +123,35 @@ def predictive(prepared: Prepared) -> SaturatedLQ:
 
 
 def responses(prepared: Prepared) -> Scores:
-    """How expert, imitating policy, improved policy and predictive controller respond to the same disturbances."""
-    session = prepared.session
-    controllers: dict[str, Controller | LSTMPolicy] = {
-        "expert": session.expert,
-        "offline": prepared.imitator,
-        "online": prepared.improved,
-        "predictive": predictive(prepared),
-    }
-    comparison = prepared.params.comparison
-    return {name: response_figures(session, session.fresh(controller), comparison) for name, controller in controllers.items()}
+    """How expert, imitating policy and improved policy respond to the same disturbances."""
+    session, fresh = prepared.session, prepared.session.fresh
+    batches = {"expert": fresh(session.expert), "offline": fresh(prepared.imitator), "online": fresh(prepared.improved)}
+    return {name: response_figures(session, batch, prepared.params.comparison) for name, batch in batches.items()}
 
 
 def readings(prepared: Prepared) -> Scores:
     """What can be read off model, data and weights without learning.
 
     loop_share of each loop: the share of alpha* in the 1-norm. pulled: how far reaching the other loop's set point by its own
-    input moves a loop at rest, as a share of the loop's own set point change (from Eq. 4.1.3b; negative: away). never_reached:
-    the share of demonstrations whose true state never gets to the set point in a loop.
+    input moves a loop at rest, as a share of the loop's own set point change (from Eq. 4.1.3b; negative: away). not_reached:<n>:
+    the share of demonstrations whose true state, on average over the last n samples, lies outside the band about the set point.
     """
-    session = prepared.session
-    loops = session.params.process.controlled
-    share = prepared.weights.abs().reshape(-1, len(loops)).sum(0) / prepared.weights.abs().sum()
+    session, comparison = prepared.session, prepared.params.comparison
+    share = prepared.weights.abs().reshape(-1, len(session.task.set_point)).sum(0) / prepared.weights.abs().sum()
     drift, target = session.process.drift_state, session.task.set_point
     change = -(drift - drift.diagonal().diag()) @ target / drift.diagonal() / target
-    short = (session.features.on("x").errors(prepared.demonstrations.trajectories) > 0).all(0).double().mean(0)
-    rows = {
-        f"{name}:{loop}": value
-        for name, values in (("loop_share", share), ("pulled", change), ("never_reached", short))
-        for loop, value in zip(loops, values.tolist(), strict=True)
-    }
-    return {"readings": rows}
+    error = session.features.on("x").errors(prepared.demonstrations.trajectories)
+    outside = {n: error[-n:].mean(0).abs() > comparison.band for n in comparison.reached}
+    figures = {"loop_share": share, "pulled": change} | {f"not_reached:{n}": far.double().mean(0) for n, far in outside.items()}
+    return {"readings": by_loop(session, figures)}
 
 
 # How learning goes ---------------------------------------------------------------------------------------------------
 
 
-def first_epoch(epochs: Sequence[int], values: Sequence[float], level: float) -> int:
-    """The first epoch whose value reaches a level from below; one more than the last where none does."""
-    return next((epoch for epoch, value in zip(epochs, values, strict=True) if value >= level), epochs[-1] + 1)
+def first_epoch(curve: pd.Series, level: float) -> float:
+    """The first epoch, of the index, whose value reaches a level from below; one more than the last where none does."""
+    return float(next(iter(curve.index[curve >= level]), curve.index[-1] + 1))
 
 
 def attempt(session: Session, start: LSTMPolicy, betas: Sequence[float]) -> tuple[LSTMPolicy, pd.DataFrame]:
@@ -193,50 +175,33 @@ def from_imitator(prepared: Prepared, betas: Sequence[float]) -> tuple[LSTMPolic
 
 
 def online_starts(prepared: Prepared) -> tuple[Scores, pd.DataFrame]:
-    """Online learning from the imitating policy (hot) and from an untrained one (scratch), and the curves.
+    """Online learning from the imitating policy (hot) and from an untrained one (scratch), judged alike, and the curves.
 
     Same epochs, rate, disturbances and beta. scratch_dense begins with the smaller beta of the offline features, which gives
-    learning from scratch a reward it can find, and has the headline beta in the later rounds only. learned: 1 where learning
-    could go on. epochs_to_level: when the return first reaches what learning from scratch (the better of both) ends with.
+    learning from scratch a reward it can find, and has the headline beta in the later rounds only; <start>_beta_<beta>, where it is
+    planned, has another beta throughout. learned: 1 where learning could go on. epochs_to_level: when the return first reaches
+    what learning from scratch (the better of scratch and scratch_dense) ends with.
     """
-    session, comparison = prepared.session, prepared.params.comparison
+    session, params = prepared.session, prepared.params
     rounds = session.params.case.online.epochs
-    sharp = [comparison.beta] * len(rounds)
-    dense = [session.features.params.beta, *sharp[1:]]
-    untrained = session.fresh_policy()
+    dense, sharp = session.features.params.beta, params.comparison.beta
+    betas = {"hot": [sharp] * len(rounds), "scratch": [sharp] * len(rounds), "scratch_dense": [dense, *[sharp] * (len(rounds) - 1)]}
+    if prepared.planned(params.offline_beta):
+        betas[f"hot_beta_{dense:g}"] = [dense] * len(rounds)
+    if prepared.planned(params.sparse_reward):
+        betas |= {f"scratch_beta_{beta:g}": [beta] * len(rounds) for beta in params.sparse_reward.betas}
     results = {
-        "hot": from_imitator(prepared, sharp),
-        "scratch": attempt(session, untrained, sharp),
-        "scratch_dense": attempt(session, untrained, dense),
+        name: from_imitator(prepared, of) if name.startswith("hot") else attempt(session, session.fresh_policy(), of)
+        for name, of in betas.items()
     }
     budget = float(sum(session.epochs(n_epochs) for n_epochs in rounds))
-    level = max(_last(results[name][1]) for name in ("scratch", "scratch_dense"))
+    level = max(results[name][1]["mean_return"].iloc[-1:].sum() for name in ("scratch", "scratch_dense"))  # nought without a curve
     scores = {}
     for name, (policy, curve) in results.items():
-        reached = first_epoch(curve["epochs"].tolist(), curve["mean_return"].tolist(), level) if name == "hot" else budget
-        figures = response_figures(session, session.fresh(policy), comparison)
-        scores[name] = figures | {"learned": float(len(curve) > 0), "epochs_to_level": float(reached), "epochs": budget}
-    return scores, pd.concat([curve.assign(run=name) for name, (_, curve) in results.items()], ignore_index=True)
-
-
-def _last(curve: pd.DataFrame) -> float:
-    return curve["mean_return"].iloc[-1] if len(curve) else 0.0
-
-
-def sharpness(prepared: Prepared) -> Scores:
-    """Online learning at several beta from the imitating policy, and at the first and last from scratch too, judged alike."""
-    session, params = prepared.session, prepared.params
-    if not prepared.planned(params.beta):
-        return {}
-    betas, n_rounds = params.beta.betas, len(session.params.case.online.epochs)
-    untrained = session.fresh_policy()
-    runs = {f"hot_beta_{beta:g}": from_imitator(prepared, [beta] * n_rounds) for beta in betas}
-    runs |= {f"scratch_beta_{beta:g}": attempt(session, untrained, [beta] * n_rounds) for beta in (betas[0], betas[-1])}
-    scores = {}
-    for name, (policy, curve) in runs.items():
+        reached = first_epoch(curve.set_index("epochs")["mean_return"], level) if name == "hot" else budget
         figures = response_figures(session, session.fresh(policy), params.comparison)
-        scores[name] = figures | {"learned": float(len(curve) > 0)}
-    return scores
+        scores[name] = figures | {"learned": float(len(curve) > 0), "epochs_to_level": reached, "epochs": budget}
+    return scores, pd.concat([curve.assign(run=name) for name, (_, curve) in results.items()], ignore_index=True)
 
 
 def online_budget(prepared: Prepared) -> pd.DataFrame:
@@ -264,12 +229,11 @@ def transfer(prepared: Prepared) -> Scores:
     session = prepared.session
     if session.params.case.offline.transfer_from is None:
         return {}
-    made_by = {"transfer": "04_knowledge_transfer", "offline": "02_offline_irl"}
-    histories = {kind: session.load(f"{kind}_{HEADLINE}", notebook).table("history.csv") for kind, notebook in made_by.items()}
-    smooth = {kind: history["feature_gap"].rolling(5, min_periods=1).mean() for kind, history in histories.items()}
-    least = smooth["offline"].min()
-    epochs = {kind: float(first_epoch(histories[kind]["epochs"].tolist(), (-gap).tolist(), -least)) for kind, gap in smooth.items()}
-    return {"transfer": {"epochs_to_level": epochs["transfer"]}, "from_scratch": {"epochs_to_level": epochs["offline"]}}
+    gaps = {}
+    for name, kind, made_by in (("transfer", "transfer", "04_knowledge_transfer"), ("from_scratch", "offline", "02_offline_irl")):
+        history = session.load(f"{kind}_{HEADLINE}", made_by).table("history.csv").set_index("epochs")
+        gaps[name] = history["feature_gap"].rolling(5, min_periods=1).mean()
+    return {name: {"epochs_to_level": first_epoch(-gap, -gaps["from_scratch"].min())} for name, gap in gaps.items()}
 
 
 def learn_under(session: Study, weights: Tensor, n_epochs: int, label: str) -> LSTMPolicy:

@@ -2,26 +2,29 @@
 
 The rule: a claim holds where the whole 95 % bootstrap interval of the median over seeds lies on the claimed side of the margin,
 does not hold where no part of it does (two that tie are no better than each other), and cannot be told otherwise, or with fewer
-than five seeds.
+than five seeds. Where it is one-sided, for it hangs on settings of ours, it holds or cannot be told.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 import pandas as pd
 from pydantic import Field, StringConstraints, model_validator
 
 from helpers.report.statistics import FEWEST, median_interval
-from helpers.runs.artifacts import RECORD, load_stage
+from helpers.runs.artifacts import Stage
 from helpers.settings.leaf import Count, Real, Record, Text, read_yaml, refusal, validate
 
 HOLDS, FAILS, OPEN, NOT_COMPARABLE = "holds", "does not hold", "cannot tell", "not comparable"
-COLUMNS = ("id", "section", "statement", "case", "quantity", "n", "median", "ci_low", "ci_high", "test", "verdict", "reason")
+WITHOUT_RUNS = {"not_comparable": NOT_COMPARABLE, "by_definition": HOLDS}  # tests that no number decides
+COLUMNS = ["id", "section", "statement", "case", "quantity", "n", "median", "ci_low", "ci_high"]
+COLUMNS += ["test", "verdict", "reason", "changed"]
+INDEX = ["case", "quantity"]
 Reference = Annotated[str, StringConstraints(strict=True, pattern=r"^\w+/[\w:]+/[\w:\-]+$")]  # <stage>/<run>/<metric>
-Test = Literal["value_above", "value_below", "difference_above", "difference_below", "ratio_above", "ratio_below", "not_comparable"]
+Dated = Annotated[str, StringConstraints(strict=True, pattern=r"^\d{4}-\d\d-\d\d: \S")]
+TESTS = rf"^(value|difference|ratio)_(above|below)$|^({'|'.join(WITHOUT_RUNS)})$"
 
 
 class Quantity(Record):
@@ -32,24 +35,29 @@ class Quantity(Record):
 
 
 class Claim(Record):
-    """One checkable sentence of the paper, and what decides about it."""
+    """One checkable sentence of the paper, and what decides about it.
+
+    Attributes:
+        one_sided: failing tells nothing, because it may be one of our settings.
+        changed: when and why the test was changed after results were known.
+    """
 
     section: Text
     statement: Text
     cases: Annotated[tuple[Count, ...], Field(min_length=1)]
-    test: Test
+    test: Annotated[str, StringConstraints(strict=True, pattern=TESTS)]
     margin: Real | None = None
+    one_sided: bool = False
     why: Text
     quantities: dict[Text, Quantity] = Field(default_factory=dict)
+    changed: Dated | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if self.test == "not_comparable":
-            if self.margin is not None or self.quantities:
-                raise refusal("a claim that is not comparable has neither 'margin' nor 'quantities'")
-            return self
-        if self.margin is None or not self.quantities:
-            raise refusal(f"the test '{self.test}' needs 'margin' and 'quantities'")
+        needed = self.test not in WITHOUT_RUNS
+        if {self.margin is not None, bool(self.quantities)} != {needed}:
+            rule = "needs 'margin' and 'quantities'" if needed else "has neither 'margin' nor 'quantities'"
+            raise refusal(f"the test '{self.test}' {rule}")
         for name, quantity in self.quantities.items():
             if (quantity.against is None) != self.test.startswith("value"):
                 need = "needs no" if quantity.against else "needs an"
@@ -63,46 +71,32 @@ def load_claims(root: Path) -> dict[str, Claim]:
     return {name: validate(Claim, entry, path, name) for name, entry in read_yaml(path).items()}
 
 
-def collect(claims: Mapping[str, Claim], results: Path, scale: str, seeds: Sequence[int]) -> pd.DataFrame:
-    """Every number that the claims refer to, from the scores.csv of each stage that was run.
+def collect(claims: Mapping[str, Claim], stages: Mapping[tuple[int, int, str], Stage]) -> pd.DataFrame:
+    """Every number that the claims refer to, from the scores.csv of the stages, by case, seed and name.
 
     Returns:
-        Columns quantity (<stage>/<run>/<metric>), case, seed, value; a row less where a stage or number is missing.
-
-    Raises:
-        ArtifactError: if a stage is damaged.
+        A row for each case and quantity (<stage>/<run>/<metric>), its index, and a column for each seed; nan where it was not run.
     """
-    wanted = {
-        (case, reference)
-        for claim in claims.values()
-        for case in claim.cases
-        for quantity in claim.quantities.values()
-        for reference in (quantity.value, quantity.against)
-        if reference is not None
-    }
-    frames = []
-    for case, name in sorted({(case, reference.split("/")[0]) for case, reference in wanted}):
-        for seed in seeds:
-            folder = results / scale / f"seed_{seed}" / f"case_{case}" / name
-            if (folder / RECORD).is_file():
-                scores = load_stage(folder, f"the stage '{name}'").table("scores.csv", ("stage", "metric", "value"))
-                quantity = name + "/" + scores["stage"] + "/" + scores["metric"]
-                kept = quantity.isin({reference for of_case, reference in wanted if of_case == case})
-                frames.append(pd.DataFrame({"quantity": quantity, "case": case, "seed": seed, "value": scores["value"]})[kept])
-    columns = ["quantity", "case", "seed", "value"]
-    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=columns)
+    pairs = ((claim.cases, quantity) for claim in claims.values() for quantity in claim.quantities.values())
+    wanted = {(case, reference) for cases, quantity in pairs for case in cases for _, reference in quantity if reference}
+    rows = [pd.DataFrame(columns=[*INDEX, "seed", "value"])]
+    for (case, seed, name), stage in stages.items():
+        scores = stage.table("scores.csv", ("stage", "metric", "value"))
+        quantity = name + "/" + scores["stage"] + "/" + scores["metric"]
+        rows.append(pd.DataFrame({"case": case, "quantity": quantity, "seed": seed, "value": scores["value"]}))
+    table = pd.concat(rows, ignore_index=True).pivot_table(index=INDEX, columns="seed", values="value", aggfunc="first")
+    return table[table.index.isin(wanted)].astype(float)
 
 
-@dataclass(frozen=True)
-class Verdict:
+class Verdict(NamedTuple):
     """How a claim fared on one quantity: seeds, median and 95 % interval of what is compared with the margin, and the verdict."""
 
-    n: int
-    median: float
-    ci_low: float
-    ci_high: float
     verdict: str
     reason: str
+    n: int = 0
+    median: float = np.nan
+    ci_low: float = np.nan
+    ci_high: float = np.nan
 
 
 def judge(claim: Claim, values: pd.DataFrame) -> Verdict:
@@ -112,8 +106,8 @@ def judge(claim: Claim, values: pd.DataFrame) -> Verdict:
         values: a row for each seed, with the columns `value` and, where the test compares two, `against`.
     """
     kind, _, side = claim.test.partition("_")
-    if claim.test == "not_comparable":
-        return Verdict(0, np.nan, np.nan, np.nan, NOT_COMPARABLE, claim.why)
+    if claim.test in WITHOUT_RUNS:
+        return Verdict(WITHOUT_RUNS[claim.test], claim.why)
     assert claim.margin is not None  # the record's own check
     compared = values["value"]
     if kind == "difference":
@@ -122,20 +116,21 @@ def judge(claim: Claim, values: pd.DataFrame) -> Verdict:
         compared = compared / values["against"]
     found = compared[np.isfinite(compared)].to_numpy(dtype=float)
     if not len(found):
-        return Verdict(0, np.nan, np.nan, np.nan, OPEN, "not run")
+        return Verdict(OPEN, "not run")
     low, high = (float(end) for end in median_interval(found))
-    sign = 1 if side == "above" else -1
-    nearest, farthest = (low, high) if side == "above" else (high, low)
+    ahead = sorted(end - claim.margin if side == "above" else claim.margin - end for end in (low, high))
     if len(found) < FEWEST:
         verdict, reason = OPEN, f"{len(found)} seed(s), fewer than {FEWEST}"
-    elif sign * nearest > sign * claim.margin:
+    elif ahead[0] > 0:
         verdict, reason = HOLDS, f"the whole interval lies {side} {claim.margin:g}"
-    elif sign * farthest <= sign * claim.margin:
+    elif ahead[1] <= 0:
         tie = kind != "value" and low == high == claim.margin
-        verdict, reason = FAILS, "a tie" if tie else f"no part of the interval lies {side} {claim.margin:g}"
+        verdict = OPEN if claim.one_sided else FAILS
+        reason = "a tie" if tie else f"no part of the interval lies {side} {claim.margin:g}"
+        reason += ", with settings of ours" * claim.one_sided
     else:
         verdict, reason = OPEN, f"the interval holds {claim.margin:g}"
-    return Verdict(len(found), float(np.median(found)), low, high, verdict, reason)
+    return Verdict(verdict, reason, len(found), float(np.median(found)), low, high)
 
 
 def verdicts(claims: Mapping[str, Claim], values: pd.DataFrame) -> pd.DataFrame:
@@ -147,25 +142,14 @@ def verdicts(claims: Mapping[str, Claim], values: pd.DataFrame) -> pd.DataFrame:
     Returns:
         Columns `COLUMNS`; median and interval are those of what the test compares with the margin.
     """
-    table = values.pivot_table(index=["case", "quantity"], columns="seed", values="value", aggfunc="first")
     rows = []
     for name, claim in claims.items():
+        rule = claim.test.replace("_", " ") + ("" if claim.margin is None else f" {claim.margin:g}")
+        words = {"id": name, "section": claim.section, "statement": claim.statement, "test": rule, "changed": claim.changed or ""}
         for case in claim.cases:
             quantities: list[tuple[str, Quantity | None]] = [*claim.quantities.items()] or [("", None)]
             for label, quantity in quantities:
-                verdict = judge(claim, _paired(table, case, quantity))
-                head = {"id": name, "section": claim.section, "statement": claim.statement, "case": case, "quantity": label}
-                rows.append(head | asdict(verdict) | {"test": rule_in_words(claim)})
-    return pd.DataFrame(rows, columns=list(COLUMNS))
-
-
-def rule_in_words(claim: Claim) -> str:
-    """The test and its margin: difference above 0."""
-    words = claim.test.replace("_", " ")
-    return words if claim.margin is None else f"{words} {claim.margin:g}"
-
-
-def _paired(table: pd.DataFrame, case: int, quantity: Quantity | None) -> pd.DataFrame:
-    """The values of a quantity by seed, beside what it is compared with; nan where they were not run."""
-    names = ("value", "against")
-    return pd.DataFrame({name: table.reindex([(case, getattr(quantity, name, None))]).iloc[0] for name in names})
+                pair = {kind: values.reindex([(case, reference)]).iloc[0] for kind, reference in quantity or ()}
+                verdict = judge(claim, pd.DataFrame(pair))
+                rows.append(words | {"case": case, "quantity": label} | verdict._asdict())
+    return pd.DataFrame(rows, columns=COLUMNS)

@@ -35,8 +35,9 @@ class Results:
             transfer case learned from nothing). The ratios of `scorecard.relative` are among the rows.
         made_from: `identity.inputs` of the report itself.
         missing: of the seeds asked for, those of which a stage is missing, where that is allowed.
-        claims: columns `claims.COLUMNS`; budget: seed, case, episodes_per_epoch, objective; trials: trial, family,
-            description, case, seed, gap. Each is empty where it was not run. inferred: what notebook 00 wrote, if it was run.
+        claims: columns `claims.COLUMNS`; claim_values: the numbers behind them, of `claims.collect`; budget: seed, case,
+            episodes_per_epoch, objective; trials: trial, family, description, case, seed, gap. Each is empty where it was not run.
+        inferred: what notebook 00 wrote, if it was run.
         limits: by case, seed and part of notebook 06, where it was run to its end.
         beyond: every stage beyond the paper's own runs, those of claims, budget, trials, limits and inferred settings.
     """
@@ -47,6 +48,7 @@ class Results:
     stages: dict[tuple[int, int, str], Stage]
     seeds: pd.DataFrame
     claims: pd.DataFrame
+    claim_values: pd.DataFrame
     budget: pd.DataFrame
     trials: pd.DataFrame
     inferred: Stage | None = None
@@ -136,13 +138,16 @@ def collect(
     tried = (stage for found in trials.values() for stage in found.values())
     beyond = (*experiments.values(), *budget.values(), *tried, *limits.values(), *([inferred] if inferred else []))
     check([*stages.values(), *beyond], root / scale, params_root)
+    known = claims.load_claims(params_root) if experiments else {}
+    claim_values = claims.collect(known, stages | {(*place, EXPERIMENTS): stage for place, stage in experiments.items()})
     return Results(
         scale=scale,
         params=params,
         published=published,
         stages=stages,
         seeds=seeds,
-        claims=_claims(root, params_root, scale, seeds_found) if experiments else pd.DataFrame(columns=list(claims.COLUMNS)),
+        claims=claims.verdicts(known, claim_values),
+        claim_values=claim_values,
         budget=_budget(budget),
         trials=_trials(params, seeds, trials),
         inferred=inferred,
@@ -176,12 +181,6 @@ def _limits(root: Path, cases: tuple[int, ...], seeds: Sequence[int]) -> dict[tu
         folder = root / f"seed_{seed}" / f"case_{case}"
         found |= {(case, seed, part): load_stage(folder / f"limits_{part}", "notebook 06") for part in LIMITS}
     return found
-
-
-def _claims(root: Path, params_root: Path, scale: str, seeds: Sequence[int]) -> pd.DataFrame:
-    """The verdicts on the claims."""
-    known = claims.load_claims(params_root)
-    return claims.verdicts(known, claims.collect(known, root, scale, seeds))
 
 
 def _budget(found: Mapping[tuple[int, int], Stage]) -> pd.DataFrame:

@@ -119,7 +119,7 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     ]
     tabulated["time"] = pd.DataFrame(seconds).groupby(["case", "stage"], as_index=False)["seconds"].median()
     if len(results.claims):
-        tabulated["claims"] = results.claims
+        tabulated |= {"claims": results.claims, "claims_seeds": results.claim_values.reset_index()}
     if len(results.trials):
         trials = tables.trials_table(results.trials)
         words = scorecard.against_headline(results.trials)

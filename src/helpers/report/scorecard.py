@@ -90,9 +90,9 @@ def gaps(medians: pd.DataFrame, published: Mapping[int, PublishedCase]) -> pd.Da
 def verdict(row: str, published: float, n_seeds: int, low: float, high: float) -> tuple[str, str]:
     """The verdict on one published number and, in a clause, its reason. The rule:
 
-    `fitted` for the row whose settings were inferred from these numbers; `cannot tell` with fewer than two seeds, or where the
-    prediction interval reaches further than a quarter of the published value to either side of its middle; otherwise `match`
-    where the published value lies inside the interval, its ends included, and `differs` where it does not.
+    `fitted` for the row whose settings were inferred from these numbers; `cannot tell` with fewer than two seeds; otherwise
+    `differs` where the published value lies outside the prediction interval, however wide that is, and inside it, its ends
+    included, `match`, or `cannot tell` where it reaches further than a quarter of the value to either side of its middle.
 
     Args:
         low, high: 95 % prediction interval for one run.
@@ -108,7 +108,7 @@ def verdict(row: str, published: float, n_seeds: int, low: float, high: float) -
         reason = f"{distance:.2g} {'above' if published > high else 'below'} the interval"
     if row == FITTED:
         return "fitted", reason
-    if reach > WIDEST * abs(published):
+    if inside and reach > WIDEST * abs(published):
         return "cannot tell", f"one run scatters by {reach:.2g} to either side of {(low + high) / 2:.{decimals}f}"
     return ("match" if inside else "differs"), reason
 

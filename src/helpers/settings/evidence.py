@@ -32,6 +32,7 @@ class ComparisonParams(Record):
 
     n_last: Annotated[Count, Leaf("samples")]
     band: Annotated[Positive, Leaf("share of the set point change")]
+    reached: Annotated[tuple[Count, ...], Field(min_length=1), Leaf("samples")]
     beta: Annotated[Positive, Leaf("-")]
 
 
@@ -46,8 +47,8 @@ class ExperimentCases(Record):
         return case in self.cases and (self.seeds is None or seed < self.seeds)
 
 
-class FrozenWeightsParams(ExperimentCases):
-    """A policy from scratch under weights that stay as they are."""
+class LearnedParams(ExperimentCases):
+    """A policy learned offline, in fewer epochs than the case's."""
 
     epochs: Annotated[Count, Leaf("epochs")]
 
@@ -71,16 +72,9 @@ class BaselineParams(ExperimentCases):
     episodes: Annotated[Count, Field(gt=1), Leaf("episodes")]
 
 
-class FeatureSetsParams(ExperimentCases):
-    """Algorithm 2 on some of the features, and on all of them alike."""
-
-    epochs: Annotated[Count, Leaf("epochs")]
-
-
-class OtherDemonstratorParams(ExperimentCases):
+class OtherDemonstratorParams(LearnedParams):
     """Demonstrators other than the PID."""
 
-    epochs: Annotated[Count, Leaf("epochs")]
     horizon: Annotated[Count, Leaf("samples")]
     move_penalty: Annotated[Positive, Leaf("-")]
     by_hand: Annotated[Text, Leaf("-")]
@@ -101,11 +95,10 @@ class CloningParams(ExperimentCases):
     check_every: Annotated[Count, Leaf("gradient steps")]
 
 
-class FewerDemonstrationsParams(ExperimentCases):
+class FewerDemonstrationsParams(LearnedParams):
     """Algorithm 2 on a part of the demonstrations."""
 
     demonstrations: Annotated[tuple[Annotated[Count, Field(gt=1)], ...], Field(min_length=1), Leaf("trajectories")]
-    epochs: Annotated[Count, Leaf("epochs")]
 
 
 class ConditionParams(Record):
@@ -120,12 +113,13 @@ class ExperimentParams(Record):
     """params/experiments.yaml: the extra runs behind the claims."""
 
     comparison: ComparisonParams
-    frozen_weights: FrozenWeightsParams
+    frozen_weights: LearnedParams
     undiscounted: ExperimentCases
-    beta: BetaParams
+    offline_beta: ExperimentCases
+    sparse_reward: BetaParams
     budget: BudgetParams
     baseline: BaselineParams
-    feature_sets: FeatureSetsParams
+    feature_sets: LearnedParams
     demonstrators: OtherDemonstratorParams
     cloning: CloningParams
     fewer_demonstrations: FewerDemonstrationsParams

@@ -193,9 +193,10 @@ class VariantParams(Record):
 class TrialParams(Record):
     """params/trials.yaml: a trial of offline learning, as the changes that it makes to a variant.
 
-    `learner`, `weights` and `exploration` hold the changed leaves as the file has them.
+    `learner`, `weights` and `exploration` hold the changed leaves as the file has them; `cases` is where `make evidence` runs it.
     """
 
+    cases: Annotated[tuple[Count, ...], Field(min_length=1)] = (1, 3)
     base: Text
     title: Text
     family: Literal[

@@ -57,7 +57,7 @@ def test_the_cost_has_the_mean_of_the_objective(ground):
     drawn = ground.draw(n, stream(1, "episodes"))
     case = ground.cases[1]
     drawn = replace(drawn, set_point=case.task.set_point.expand_as(drawn.set_point))
-    run = track(TrackingPID(ground.record), drawn, ground.bounds)
+    run = track(TrackingPID(ground.record, ground.bounds), drawn, ground.bounds)
     reward = tracking_reward((case.task.set_point - run.x[1:]) / case.task.error_scale, ground.beta)
     weights = discounts(len(reward), 0.99, reward)
     sampled, expected = 1 - weights @ reward / (2 * weights.sum()), ground.lost(drawn, run, ground.beta)

@@ -40,11 +40,11 @@ def tracking_pid(case, parts=PARTS, wider=1.0):
     return TrackingPID(gains(parts), bounds(case, wider))
 
 
-def fresh(case, seed=None):
-    """A policy whose output layer is zero, or random with a seed."""
+def fresh(case, seed=None, kept=None):
+    """A policy whose output layer is zero, or random with a seed; `kept`: of the patient form."""
     torch.manual_seed(0 if seed is None else seed)
     unit = case.task.error_scale.abs()
-    policy = TrackingPolicy(case.params.learning.policy, gains(), unit, case.task.set_point, unit, bounds(case))
+    policy = TrackingPolicy(case.params.learning.policy, gains(), unit, case.task.set_point, unit, bounds(case), kept)
     if seed is not None:
         with torch.no_grad():
             for parameter in policy.output.parameters():
@@ -67,8 +67,6 @@ def test_with_an_output_layer_of_zero_it_is_the_pid(study):
     drawn = episodes(case, case.task.set_point.expand(40, 2))
     noise = torch.randn(41, 3, 2, generator=stream(1, "noise"), dtype=case.dtype)
     drawn = replace(drawn, noise=noise, disturbance=noise[1:])
-    with torch.no_grad():
-        policy.kept_logit.fill_(-torch.inf)
     found, expected = (track(tracker, drawn, bounds(case)) for tracker in (policy, tracking_pid(case)))
     torch.testing.assert_close(found.u, expected.u, rtol=1e-10, atol=1e-10)
     for found_part, part in zip(vars(policy.gains).values(), vars(gains()).values(), strict=True):
@@ -84,6 +82,19 @@ def test_away_from_the_bounds_it_is_the_pid_of_the_paper(study):
         for controller in (AtSetPoint(tracking_pid(case, parts), case.task), paper_pid(case, parts))
     ]
     torch.testing.assert_close(runs[0].u, runs[1].u, rtol=1e-9, atol=1e-9)
+
+
+def test_what_keeps_all_that_a_bound_cuts_off_is_the_pid_of_the_paper(study):
+    """Which goes on integrating at a bound."""
+    case = study()
+    with torch.no_grad():
+        policy = fresh(case, kept=1 - 1e-13)
+        policy.derivative.zero_()
+        runs = [
+            rollout(case.process, controller, case.task, 4, stream(0, "episodes")).u
+            for controller in (AtSetPoint(policy, case.task), paper_pid(case, (PARTS[0], PARTS[1], [0.0, 0.0])))
+        ]
+    torch.testing.assert_close(*runs, rtol=1e-7, atol=1e-7)
 
 
 def test_the_input_that_was_applied_counts(case):
@@ -109,9 +120,10 @@ def test_noise_near_a_bound_does_not_move_the_mean(study):
     assert (target - run.x[300:].mean((0, 1)))[0].abs() < 0.05
 
 
+@pytest.mark.parametrize("kept", [None, 0.8])
 @pytest.mark.parametrize("seed", range(3))
-def test_whatever_the_network_has_learned_no_offset_stays(case, seed):
-    policy = fresh(case, seed)
+def test_whatever_the_network_has_learned_no_offset_stays(case, seed, kept):
+    policy = fresh(case, seed, kept)
     with torch.no_grad():
         run = track(policy, episodes(case, case.task.set_point.expand(600, 2), load=0.7), bounds(case))
     assert run.movement[-1].max() < 1e-7, "a random network that is stable here"
@@ -120,22 +132,22 @@ def test_whatever_the_network_has_learned_no_offset_stays(case, seed):
     assert (run.u[:20] - start.u[:20]).abs().max() > 0.1, "and that does something"
 
 
-@pytest.mark.parametrize("seed", [None, 0, 1])
-def test_nothing_winds_up_at_a_bound(case, seed):
+@pytest.mark.parametrize(("seed", "kept"), [(None, None), (0, None), (1, 0.8)])
+def test_nothing_winds_up_at_a_bound(case, seed, kept):
     """A set point out of reach, for long or for very long: afterwards the same response."""
     far, near = (torch.tensor(target, dtype=case.dtype) for target in ([-8.0, 4.0], [-1.0, 4.0]))
     responses = []
     for waiting in (300, 900):
         drawn = episodes(case, torch.cat([far.expand(waiting, 2), near.expand(60, 2)]))
         with torch.no_grad():
-            run = track(fresh(case, seed), drawn, bounds(case))
+            run = track(fresh(case, seed, kept), drawn, bounds(case))
         assert torch.equal(run.u[waiting - 1, :, 0], torch.full((3,), -20.0, dtype=case.dtype))
         responses.append(run.x[waiting:])
     torch.testing.assert_close(responses[0], responses[1], rtol=1e-6, atol=1e-6)
 
 
 def test_every_parameter_is_learned(case):
-    policy = fresh(case, 0)
+    policy = fresh(case, 0, kept=0.8)
     run = track(policy, episodes(case, case.task.set_point.expand(30, 2)), bounds(case))
     run.error.square().mean().backward()
     still = [name for name, parameter in policy.named_parameters() if parameter.grad is None or not parameter.grad.any()]

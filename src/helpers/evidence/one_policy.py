@@ -87,7 +87,8 @@ class Ground:
         torch.manual_seed(int(torch.randint(2**31, (1,), generator=self.session.stream("one_policy", "weights"))))
         low, high = self.set_points.amin(0), self.set_points.amax(0)
         unit = self.session.task.error_scale.abs()
-        return TrackingPolicy(self.session.params.learning.policy, gains, unit, (low + high) / 2, (high - low) / 2, self.bounds)
+        shape = (gains, unit, (low + high) / 2, (high - low) / 2, self.bounds)
+        return TrackingPolicy(self.session.params.learning.policy, *shape, self.params.descent.kept)
 
     def draw(self, n_episodes: int, generator: torch.Generator, margin: float = 0.0, load: float = 0.0) -> Scenarios:
         """Episodes from u* = 0 with a set point each: a case's times factors within the grid's, or any in the range of the grid.

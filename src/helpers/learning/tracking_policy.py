@@ -1,11 +1,14 @@
 """One policy for a range of set points: a PID plus what a recurrent network adds to it.
 
-u_t = clip(s_t + q_t) with q_t = P e_t + D (e_t - e_{t-1}) + c_t and the integral s_t, where e = y_sp - y, and c_t is the network's
-correction. At rest neither q nor s changes, so that I e = 0: no offset stays, whatever was learned. Of what s_{t-1} + I e_t exceeds
-the bounds of the input a share k is kept (back-calculation, Astrom and Hagglund 2006, Section 3.5): nothing winds up for long, and
-with k = 0 nothing at all. What the bounds cut off q is not lost, so that noise near a bound shifts nothing, as it does in the usual
-velocity form. s_{t-1} is u_{t-1} + (what was cut off then) - q_{t-1} with the input that was applied: whoever moves it by hand
-hands over without a jump. Where the network's output layer and k are zero this is a PID.
+u_t = clip(s_t + q_t) with q_t = P e_t + D (e_t - e_{t-1}) + c_t and the integral s_t = clip(s_{t-1} + I e_t), where e = y_sp - y
+and c_t is the network's correction. At rest neither q nor s changes, so that I e = 0: no offset stays, whatever was learned. The
+integral stays within the bounds of the input, so that nothing winds up. What the bounds cut off q is not lost, so that noise near a
+bound shifts nothing, as it does in the usual velocity form. s_{t-1} is u_{t-1} + x_{t-1} - q_{t-1} with the input that was applied
+and what was cut off, x: whoever moves it by hand hands over without a jump.
+
+For plants whose inputs sit at their bounds for long there is a patient form, which does not leave a bound as soon as the error
+shrinks: s_t = u_{t-1} + k x_{t-1} - q_{t-1} + I e_t with k in (0, 1) learned (back-calculation, Astrom and Hagglund 2006, Section
+3.5). Where the network's output layer is zero, both are PIDs.
 """
 
 from dataclasses import dataclass
@@ -18,7 +21,6 @@ from helpers.plant.tracking import Bounds
 from helpers.settings.paper import PolicyParams
 
 SHARPNESS = 10.0  # asinh(10 e) tells small errors apart and does not run away for large ones
-KEPT = 0.8  # k at the start; learned from there on
 
 
 @dataclass(frozen=True)
@@ -36,18 +38,19 @@ class Gains:
         memory: tuple[Tensor, ...],
         bounds: Bounds,
         correction: Tensor | float = 0.0,
-        kept: Tensor | float = 0.0,
+        kept: Tensor | None = None,
     ) -> tuple[Tensor, tuple[Tensor, ...]]:
         """The command (K, n_u) of the module's formula, and the memory after it.
 
         Args:
             error: at this sample, (K, n_y). u_previous: the input applied last, (K, n_u). correction: of the network, (K, n_u).
-            kept: k, (n_u,). memory: the error one sample before, what the bounds cut off the last command, and q.
+            kept: k of the patient form, (n_u,). memory: the error one sample before, what the bounds cut off then, and q.
         """
         once, excess, quick = memory
-        integral = u_previous + excess - quick + _times(self.integral, error)
-        within = integral.clamp(bounds.low, bounds.high)
-        integral = within + kept * (integral - within)
+        if kept is None:
+            integral = (u_previous + excess - quick + _times(self.integral, error)).clamp(bounds.low, bounds.high)
+        else:
+            integral = u_previous + kept * excess - quick + _times(self.integral, error)
         quick = _times(self.proportional, error) + _times(self.derivative, error - once) + correction
         command = integral + quick
         return command, (error, command - command.clamp(bounds.low, bounds.high), quick)
@@ -88,7 +91,7 @@ class TrackingPolicy(nn.Module):
 
     Args:
         gains: of the PID that it starts from. unit: scale of each error (n_y,).
-        centre, reach: middle and half width of the range of set points, (n_y,).
+        centre, reach: middle and half width of the range of set points, (n_y,). kept: k at the start, for the patient form.
     """
 
     unit: Tensor
@@ -97,8 +100,18 @@ class TrackingPolicy(nn.Module):
     low: Tensor
     high: Tensor
     integral: Tensor
+    kept_logit: nn.Parameter | None
 
-    def __init__(self, params: PolicyParams, gains: Gains, unit: Tensor, centre: Tensor, reach: Tensor, bounds: Bounds) -> None:
+    def __init__(
+        self,
+        params: PolicyParams,
+        gains: Gains,
+        unit: Tensor,
+        centre: Tensor,
+        reach: Tensor,
+        bounds: Bounds,
+        kept: float | None = None,
+    ) -> None:
         super().__init__()
         self.params = params
         n_u, n_y = gains.integral.shape
@@ -122,7 +135,7 @@ class TrackingPolicy(nn.Module):
         self.proportional = nn.Parameter(gains.proportional / self._scale)
         self.derivative = nn.Parameter(gains.derivative / self._scale)
         self.integral_log = nn.Parameter(torch.zeros_like(gains.integral))  # the integral action keeps its sign and never vanishes
-        self.kept_logit = nn.Parameter(torch.full_like(bounds.low, KEPT).logit())
+        self.register_parameter("kept_logit", None if kept is None else nn.Parameter(torch.full_like(bounds.low, kept).logit()))
 
     @property
     def lstms(self) -> list[nn.LSTM]:
@@ -134,9 +147,9 @@ class TrackingPolicy(nn.Module):
         return (self.high - self.low)[:, None] / 2 / self.unit
 
     @property
-    def kept(self) -> Tensor:
-        """k, (n_u,)."""
-        return torch.sigmoid(self.kept_logit)
+    def kept(self) -> Tensor | None:
+        """k, (n_u,), or None where the integral stays within the bounds."""
+        return None if self.kept_logit is None else torch.sigmoid(self.kept_logit)
 
     @property
     def gains(self) -> Gains:

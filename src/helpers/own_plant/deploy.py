@@ -51,8 +51,10 @@ class PolicyStep(nn.Module):
         super().__init__()
         self.cells = list(policy.params.hidden_cells)
         self.slope = policy.params.leaky_slope
-        doubles = {**vars(policy.gains), "steady_y": steady_y, "steady_u": steady_u}
-        doubles |= {name: getattr(policy, name) for name in ("kept", "unit", "centre", "reach", "low", "high")}
+        self.patient = policy.kept is not None
+        kept = torch.ones_like(policy.low) if policy.kept is None else policy.kept
+        doubles = {**vars(policy.gains), "kept": kept, "steady_y": steady_y, "steady_u": steady_u}
+        doubles |= {name: getattr(policy, name) for name in ("unit", "centre", "reach", "low", "high")}
         for name, value in doubles.items():
             self.register_buffer(name, value.detach().double())
         singles = {"output_weight": policy.output.weight, "output_bias": policy.output.bias}
@@ -83,9 +85,9 @@ class PolicyStep(nn.Module):
             after += [hidden, cell]
             signal = functional.leaky_relu(hidden, self.slope)
         correction = functional.linear(signal, self.output_weight, self.output_bias).double() * half
-        integral = last + excess - quick + error @ self.integral.T
-        within = self.within(integral)
-        integral = within + self.kept * (integral - within)
+        integral = last + self.kept * excess - quick + error @ self.integral.T
+        if not self.patient:
+            integral = self.within(integral)
         quick = error @ self.proportional.T + (error - once) @ self.derivative.T + correction
         u = self.within(integral + quick)
         return (u + self.steady_u, error, integral + quick - u, quick, *after)

@@ -36,6 +36,7 @@ class DescentParams(Record):
     rate_start: Annotated[Share, Leaf("-")]
     rate_end: Annotated[Share, Leaf("-")]
     movement: Annotated[Positive, Leaf("movement of the record's controller")]
+    kept: Annotated[Memory, Leaf("share")]
 
 
 class HotStartParams(Record):

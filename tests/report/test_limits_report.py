@@ -142,7 +142,7 @@ def test_where_improving_on_the_plant_beats_who_does_not_know_it(results):
 
 def test_what_a_practitioner_reads(results):
     found = limits_report.answers(results(3))
-    assert "after 500 episodes IRL, then policy gradient is best, $J$ = 13.0" in found[1]
+    assert "after 500 episodes IRL, then REINFORCE is best, $J$ = 13.0" in found[1]
     assert "passes offset-free MPC at none of these budgets" in found[1]
     assert "passes offset-free MPC from 500 episodes on" in found[2]
 
@@ -150,9 +150,9 @@ def test_what_a_practitioner_reads(results):
 def test_with_seeds_enough_only_whole_intervals_count(results):
     """Of seeds 0 to 4 the paper's way ends at 12 to 16 in Case I and at 22 to 26 in Case II, PPO two below it, the MPC has 19."""
     found = limits_report.answers(results(5))
-    assert "after 500 episodes IRL, then policy gradient, $J$ = 14.0 (ahead of all others)" in found[1]
+    assert "after 500 episodes IRL, then REINFORCE, $J$ = 14.0 (ahead of all others)" in found[1]
     assert "by the whole interval: after 500 none." in found[1]
-    assert "by the whole interval: after 500 IRL, then policy gradient, PPO from scratch." in found[2]
+    assert "by the whole interval: after 500 IRL, then REINFORCE, PPO from scratch." in found[2]
 
 
 def test_learners_that_cannot_be_told_apart():
@@ -163,7 +163,7 @@ def test_learners_that_cannot_be_told_apart():
     rows = [(seed, name, value + seed) for seed in range(5) for name, value in (*reached, ("scratch_reinforce", 1.0 + seed))]
     listed = pd.DataFrame(rows, columns=["seed", "learner", 100]).set_index(["seed", "learner"])
     told = limits_report._answer_over_seeds(own, listed)
-    assert "after 100 episodes policy gradient from scratch, $J$ = 5.0 (not to be told apart from PPO from scratch)" in told
+    assert "after 100 episodes REINFORCE from scratch, $J$ = 5.0 (not to be told apart from PPO from scratch)" in told
     assert "by the whole interval: after 100 PPO from scratch." in told  # the other one is no better than the MPC with seed 0
 
 

@@ -6,9 +6,8 @@ import pandas as pd
 import pytest
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from helpers.report import limits_report
+from helpers.report import limits_findings, limits_report, typesetting
 from helpers.report.collection import LIMITS
-from helpers.report.report import stacked
 from helpers.report.tables import to_markdown
 from helpers.runs.artifacts import load_stage, save_stage
 from helpers.runs.sources import PROJECT
@@ -70,7 +69,7 @@ def write(folder, level):
 def test_nothing_where_it_was_not_run(results):
     assert limits_report.tabulate(results(1, written=False)) == {}
     assert limits_report.draw(results(1, written=False)) == {}
-    assert limits_report.find(results(1, written=False)) == {}
+    assert limits_findings.find(results(1, written=False)) == {}
 
 
 def test_one_seed_shows_its_monte_carlo_interval(results):
@@ -98,9 +97,15 @@ def test_several_seeds_show_medians(results):
     found = limits_report.tabulate(results(3))
     assert found["limits_gaps"].set_index("controller").loc["offset-free MPC"].tolist() == ["11.0", "21.0"]
     figures = limits_report.draw(results(3))
-    assert set(figures) == {f"limits_{name}_case_{case}" for name in ("budget", "gaps", "model", "set_point") for case in (1, 2)}
-    line = next(line for line in figures["limits_budget_case_1"].axes[0].lines if line.get_label() == "PPO from scratch")
-    assert line.get_ydata().tolist() == [1.0, 11.0]
+    maps = [f"limits_{name}_case_{case}" for case in (1, 2) for name in ("model", "set_point")]
+    assert set(figures) == {"limits_budget", "limits_gaps", "limits_robustness", *maps}
+    assert limits_report.heat_map_names(results(3)) == maps
+    for axes, level in zip(figures["limits_budget"].axes, (11.0, 21.0), strict=True):
+        line = next(line for line in axes.lines if line.get_label() == "PPO from scratch")
+        assert line.get_ydata().tolist() == [1.0, level]
+    assert [axes.get_label() for axes in figures["limits_gaps"].axes] == ["A case 1", "B case 2"]
+    first = {line.get_label(): sorted(line.get_xdata()) for line in figures["limits_robustness"].axes[0].lines[:-1]}
+    assert first == {"model": [50.0, 100.0, 100.0], "set points": [40.0, 100.0, 120.0]}
 
 
 @pytest.mark.parametrize(
@@ -124,8 +129,8 @@ def test_the_papers_way_beside_its_rivals(results):
     assert budget.loc[("I", "PPO from scratch"), "least to greatest at the end"] == "10.00 to 12.00"
     pairs = limits_report.tabulate(results(1))["limits_pairs"].set_index(["case", "rival"])
     assert pairs.loc[("I", "PPO from scratch")].tolist() == ["14.00", "2.00"]
-    assert limits_report.standings(results(1)) == {}
-    assert limits_report.standings(results(5)) == {0: {"ppo": {"ahead": [1, 2]}}, 500: {"ppo": {"ahead": [1, 2]}}}
+    assert limits_findings.standings(results(1)) == {}
+    assert limits_findings.standings(results(5)) == {0: {"ppo": {"ahead": [1, 2]}}, 500: {"ppo": {"ahead": [1, 2]}}}
 
 
 def test_the_plants_that_were_improved_on(results):
@@ -135,64 +140,36 @@ def test_the_plants_that_were_improved_on(results):
 
 def test_where_improving_on_the_plant_beats_who_does_not_know_it(results):
     """It reaches 10 to 14 in Case I and 20 to 24 in Case II; minimum variance has 15 there, the MPC of the grid 18."""
-    assert limits_report.there(results(4)) == {}  # too few for an interval
+    assert limits_findings.there(results(4)) == {}  # too few for an interval
     behind = ["offset-free MPC", "minimum variance on y"]
-    assert limits_report.there(results(5)) == {"A x 1.3, B x 0.7": {1: behind, 2: []}}
-
-
-def test_what_a_practitioner_reads(results):
-    found = limits_report.answers(results(3))
-    assert "after 500 episodes IRL, then REINFORCE is best, $J$ = 13.0" in found[1]
-    assert "passes offset-free MPC at none of these budgets" in found[1]
-    assert "passes offset-free MPC from 500 episodes on" in found[2]
-
-
-def test_with_seeds_enough_only_whole_intervals_count(results):
-    """Of seeds 0 to 4 the paper's way ends at 12 to 16 in Case I and at 22 to 26 in Case II, PPO two below it, the MPC has 19."""
-    found = limits_report.answers(results(5))
-    assert "after 500 episodes IRL, then REINFORCE, $J$ = 14.0 (ahead of all others)" in found[1]
-    assert "by the whole interval: after 500 none." in found[1]
-    assert "by the whole interval: after 500 IRL, then REINFORCE, PPO from scratch." in found[2]
-
-
-def test_learners_that_cannot_be_told_apart():
-    own = pd.DataFrame({"seed": range(5), "controller": "mpc", "objective": 1.0, "gap": 0.0})
-    others = ["expert", "minimum_variance", "minimum_variance_filtered"]
-    own = pd.concat([own, *(own.assign(controller=name) for name in others)])
-    reached = (("ppo", 2.0), ("mpc", 1.0))
-    rows = [(seed, name, value + seed) for seed in range(5) for name, value in (*reached, ("scratch_reinforce", 1.0 + seed))]
-    listed = pd.DataFrame(rows, columns=["seed", "learner", 100]).set_index(["seed", "learner"])
-    told = limits_report._answer_over_seeds(own, listed)
-    assert "after 100 episodes REINFORCE from scratch, $J$ = 5.0 (not to be told apart from PPO from scratch)" in told
-    assert "by the whole interval: after 100 PPO from scratch." in told  # the other one is no better than the MPC with seed 0
+    assert limits_findings.there(results(5)) == {"A x 1.3, B x 0.7": {1: behind, 2: []}}
 
 
 def test_plants_that_cannot_hold_the_set_point_are_left_out(results):
     """With A doubled, or times 1.3 and B times 0.7, the inputs that hold the set point of Case II lie above their bounds."""
     run = results(1)
-    assert limits_report.left_out(run) == {"model": {2: (2, 3)}}
-    assert limits_report.out_of_reach(run) == {"A x 1.3, B x 0.7": [2]}
+    assert limits_findings.left_out(run) == {"model": {2: (2, 3)}}
+    assert limits_findings.out_of_reach(run) == {"A x 1.3, B x 0.7": [2]}
     kept = limits_report.worst(run).query("group == 'model'").set_index(["case", "controller"])["value"]
     assert (kept[1, "online"], kept[2, "online"]) == (50.0, 80.0)
 
 
 def test_what_is_attainable(results):
     run = results(1)
-    assert limits_report.seeds(run) == {1: 1, 2: 1}
-    assert limits_report.attainable(run)[2] == pytest.approx({"look_ahead": 1.0, "noise": 5.0, "filter": 2.5})
-    assert limits_report.agreement(run) == pytest.approx(0.2)  # of the last grid only
+    assert limits_findings.seeds(run) == {1: 1, 2: 1}
+    assert limits_findings.attainable(run)[2] == pytest.approx({"look_ahead": 1.0, "noise": 5.0, "filter": 2.5})
+    assert limits_findings.agreement(run) == pytest.approx(0.2)  # of the last grid only
 
 
 def test_what_the_searches_for_gains_came_to(results):
     """They end at 5 to 7 in Case I and at 10 to 12 in Case II, from 10."""
-    found = limits_report.tuned(results(3))
+    found = limits_findings.tuned(results(3))
     assert found[1] == {"better": 0, "seeds": 3, "least": 5.0, "greatest": 6.0}
     assert found[2] == {"better": 1, "seeds": 3, "least": 10.0, "greatest": 11.0}
-    assert limits_report.visited(results(1)) == [400]
 
 
 def test_what_helps_to_choose(results):
-    found = limits_report.practice(results(1))
+    found = limits_findings.practice(results(1))
     assert found["model_ahead"] == [1]  # 18 against 12 and 22
     assert found["never_below"] == ["offset-free MPC"]
     assert found["least"] == (40.0, 40.0)
@@ -200,34 +177,61 @@ def test_what_helps_to_choose(results):
 
 
 def test_loops_that_a_learner_never_found(results):
-    assert limits_report.not_found(results(1)) == {case: ["PPO from scratch ($C_A^*$)"] for case in (1, 2)}
+    assert limits_findings.not_found(results(1)) == {case: ["PPO from scratch ($C_A^*$)"] for case in (1, 2)}
 
 
 def test_the_ranges_of_the_grids(results):
-    assert limits_report.ranges(results(1)) == (
+    assert limits_findings.ranges(results(1)) == (
         "A and B times 1 to 2 and 0.7 to 1; the set points of the two loops times 1.25 to 1.25 and 1 to 1"
     )
 
 
 def test_the_price_of_improving(results):
-    found = limits_report.price(results(1))
+    found = limits_findings.price(results(1))
     assert found[1]["worse"] == 50.0
     assert found[2]["model"] == 80.0
 
 
-def test_the_section_of_the_template(results):
-    text = (PROJECT / "reports/template/report.md.jinja").read_text(encoding="utf-8")
-    start = text.index("{% if tables.limits_gaps is defined %}")
-    macros = text[text.index("{% macro studies") : text.index("{% macro bullets")]
-    section = macros + text[start : text.index("{% if benchmarks %}", start)]
-    environment = Environment(loader=FileSystemLoader("."), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {"table": to_markdown, "numeral": lambda case: "I" * case, "stacked": stacked}
+def test_what_needs_no_plant(results):
+    """Two seeds of notebook 09, three set points of notebook 07: medians, and shares of the PID that made the record."""
+    shares = {"J(30)": [15.0, 16.0, 20.0], "share": [0.75, 0.8, 1.0], "set points, least": [0.5, 0.6, 1.0]}
+    policies = pd.DataFrame({"controller": ["one_policy", "one_policy", "minimum_variance"], "case": 1, **shares})
+    tank = pd.DataFrame({"controller": ["PID of the record"] * 2 + ["policy"] * 2, "mean |e|": [1.0, 3.0, 0.5, 1.5], "seed": 0})
+    tank = tank.assign(movement=2.0, offset=[0.1, 0.2, 0.0, 0.01])
     run = results(1)
-    found = limits_report.find(run) | {"there": {"A x 1.3, B x 0.7": {1: ["offset-free MPC"], 2: []}}}
-    shown = {"tables": limits_report.tabulate(run), "limits": found, "n_seeds": 1, "beta": "30"}
-    rendered = environment.from_string(section).render(shown)
+    run.one_policy, run.own_plant = policies.assign(**{"corners, least": float("nan")}), tank
+    found = limits_report.without_the_plant(run)
+    assert found["one_policy"].to_numpy().tolist() == [
+        ["I", "one policy, through the model", "15.5", "78", "55", "–"],
+        ["I", "minimum variance on y", "20.0", "100", "100", "–"],
+    ]
+    assert found["own_plant"].to_numpy().tolist() == [["PID of the record", "100", "100", "20.0"], ["policy", "50", "100", "1.0"]]
+    run.one_policy = run.own_plant = pd.DataFrame()
+    assert limits_report.without_the_plant(run) == {}
+
+
+def test_the_section_of_the_template(results):
+    """What the report says of the limits, from the template's own section."""
+    text = (PROJECT / "reports/template/report.md.jinja").read_text(encoding="utf-8")
+    start, end = text.index("## Which controller to take"), text.index("{% if one_policy | length %}\n\n## One policy")
+    section = text[text.index("{% from") : text.index("{% set beta")] + "{% if limits %}" + text[start:end]
+    loader = FileSystemLoader(typesetting.TEMPLATE)
+    marks = {"comment_start_string": "{##", "comment_end_string": "##}"}
+    environment = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, **marks)
+    environment.filters |= {"table": to_markdown, "numeral": lambda case: "I" * case}
+    run = results(1)
+    found = limits_findings.find(run) | {"there": {"A x 1.3, B x 0.7": {1: ["offset-free MPC"], 2: []}}}
+    shown = {"tables": limits_report.tabulate(run), "limits": found, "n_seeds": 1, "level_words": "95 %", "appendix": None}
+    shown |= {
+        "heat_maps": ["model_case_1", "set_point_case_2"],
+        "grids": {"model": "m", "set_point": "s"},
+        "rivals": {},
+        "one_policy": (),
+    }
+    rendered = typesetting.numbered(environment.from_string(section).render(shown))
     assert "10.0 [9.0, 11.0]" in rendered
-    assert "figures/limits_budget_case_2.svg" in rendered
-    words = "in Case Study I of all but offset-free MPC; in Case Study II of all. No input within the bounds holds the set point of"
-    assert f"- A x 1.3, B x 0.7: {words} Case Study II there." in rendered
-    assert environment.from_string(section).render(tables={}).strip() == ""
+    assert "](figures/limits_budget.svg)" in rendered
+    assert "lies\n  above every learner after its last one in Case Study I (" in rendered
+    assert "- all but offset-free MPC on A x 1.3, B x 0.7 in Case Study I;\n- all controllers on" in rendered
+    assert "in Case Study II (where no input within the bounds holds the set point)." in rendered
+    assert environment.from_string(section).render(limits={}).strip() == ""

@@ -76,7 +76,8 @@ def project(monkeypatch, tmp_path):
     latest, results = tmp_path / "reports/latest", tmp_path / "results"
     files = {
         latest / "report.html": "<html>",
-        latest / "report.md": "# not published",
+        latest / "report.pdf": "%PDF",
+        latest / "report.md": "# Summary",
         latest / "figures/figure_3.png": "picture",
         latest / "tables/table_2.csv": "a,b",
         latest / "tables/time.csv": "case,stage,seconds\n1,demonstrations,2.4\n2,demonstrations,3.6\n1,offline_improved,20.2\n",
@@ -113,7 +114,15 @@ def test_publishing_copies_the_report_and_the_executed_notebooks_of_the_first_se
     reference = project / "reports/reference"
     found = {str(path.relative_to(reference)) for path in reference.rglob("*") if path.is_file()}
     assert found == {
-        *("report.html", "figures/figure_3.png", "tables/table_2.csv", "tables/time.csv", "tables/gaps.csv"),
+        *(
+            "report.html",
+            "report.pdf",
+            "report.md",
+            "figures/figure_3.png",
+            "tables/table_2.csv",
+            "tables/time.csv",
+            "tables/gaps.csv",
+        ),
         *("comparison.csv", "seeds.csv", "provenance.json", "notebooks/05_report.ipynb"),
         *("notebooks/02_offline_irl_case_1.ipynb", "notebooks/02_offline_irl_printed_case_1.ipynb"),
         *("notebooks/01_demonstrations_case_3.ipynb", "reliability.md"),

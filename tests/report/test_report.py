@@ -9,7 +9,7 @@ from itertools import product
 import pandas as pd
 import pytest
 
-from helpers.report import collection, report, scorecard
+from helpers.report import collection, report, scorecard, typesetting
 from helpers.runs import freshness, identity
 from helpers.runs.artifacts import ArtifactError, save_stage
 from helpers.runs.sources import PROJECT
@@ -92,9 +92,19 @@ def test_the_report_opens_without_a_network(page):
 
 def test_links_inside_the_report_lead_somewhere(page):
     places = {attributes["id"] for _, attributes, _ in page.elements if "id" in attributes}
-    targets = [attributes["href"] for attributes, _ in page.named("a") if "href" in attributes]
-    assert len(targets) > 5
-    assert all(target.startswith("https://") or target[1:] in places for target in targets)
+    targets = {attributes["href"] for attributes, _ in page.named("a") if "href" in attributes}
+    inside = {target[1:] for target in targets if target.startswith("#")}
+    assert len(inside) > 60
+    assert inside <= places
+    assert "https://doi.org/10.1002/aic.17306" in targets
+
+
+def test_links_beside_the_report_lead_to_its_tables_and_to_the_code(page, written):
+    targets = {attributes["href"] for attributes, _ in page.named("a") if "href" in attributes}
+    beside = {target for target in targets if not target.startswith(("#", "https://"))}
+    assert {"tables/gaps.csv", "provenance.json"} <= beside
+    assert any(target.endswith("notebooks/02_offline_irl.ipynb") for target in beside)
+    assert [target for target in beside if not (written / target).resolve().exists()] == []
 
 
 def test_maths_is_typeset_and_no_markup_shows_through(page):
@@ -107,31 +117,82 @@ def test_maths_is_typeset_and_no_markup_shows_through(page):
 def test_every_figure_has_a_caption_and_alternative_text(page):
     images = page.named("img")
     benchmarks = (report.BENCHMARKS / "scaling.svg").is_file()  # of make bench, shown where it was run
-    assert len(images) == 3 + 4 * len(CASES) + benchmarks
+    assert len(images) == 2 + 3 + 5 * len(CASES) + benchmarks
     for attributes, inside in images:
         assert len(attributes.get("alt", "").split()) > 5, attributes.get("alt")
         assert "figure" in inside
     assert len({attributes["alt"] for attributes, _ in images}) == len(images)
     assert len(page.named("figcaption")) == len(page.named("figure")) == len(images)
-    text = " ".join("".join(page.text).split())
-    assert all(f"Figure {number}. " in text for number in (3, 4, 5, 6))
 
 
-def test_the_report_opens_with_one_page_to_stop_after(page):
-    """What was reproduced, what was not and what nobody could know stand before everything else."""
-    headings = [tag for tag, _, _ in page.elements if tag in ("h1", "h2")]
-    assert headings[:5] == ["h1", "h1", "h2", "h2", "h2"]
+def test_figures_tables_and_equations_are_numbered_and_linked_both_ways(page, written):
+    """Whatever has a number is led to from the text, and its number leads back; only what page one shows needs no lead."""
+    places = {attributes["id"] for _, attributes, _ in page.elements if "id" in attributes}
+    targets = [attributes["href"] for attributes, _ in page.named("a") if "href" in attributes]
+    numbered = {place for place in places if re.match(r"(fig|tab|eq)-", place)}
+    assert len(page.named("figure")) == len([place for place in numbered if place.startswith("fig-")])
+    html = (written / "report.html").read_text(encoding="utf-8")
+    assert "<table" not in re.sub(r'<div id="tab-.*?</div>', "", html, flags=re.DOTALL)
+    assert {place for place in numbered if f"#{place}" not in targets} <= {"fig-page_one"}
+    assert {f"#to-{place}" for place in numbered if place[:2] != "eq" and f"#{place}" in targets} <= set(targets)
+    text = " ".join("".join(page.text).replace("\N{NO-BREAK SPACE}", " ").split())
+    assert all(f"{words}{number}." in text for words, number in product(("Figure ", "Table ", "Figure A", "Table A"), (1, 2)))
+
+
+def test_numbers_follow_the_order_and_a_link_to_nothing_is_refused():
+    text = "See @fig:b, @fig:a and @fig:a. #fig:a# #A:fig:c# #fig:b# $#eq:d#$ @fig:c"
+    found = typesetting.numbered(text).replace("\N{NO-BREAK SPACE}", " ")
+    assert found == (
+        "See [Figure 2](#fig-b){#to-fig-b}, [Figure 1](#fig-a){#to-fig-a} and [Figure 1](#fig-a). "
+        "[Figure 1.](#to-fig-a) [Figure A1.](#to-fig-c) [Figure 2.](#to-fig-b) $(1)$ [Figure A1](#fig-c){#to-fig-c}"
+    )
+    with pytest.raises(KeyError, match="fig-x"):
+        typesetting.numbered("@fig:x")
+
+
+def words_of(written, drop):
+    html = re.sub(drop, " ", (written / "report.html").read_text(encoding="utf-8"), flags=re.DOTALL)
+    body = re.sub(r"<annotation.*?</annotation>|<[^>]*>", " ", html[html.index("<body") :], flags=re.DOTALL)
+    return re.findall(r"\w[^\s]*", body)
+
+
+def test_the_report_opens_with_one_page_to_stop_after(page, written):
+    """Claim and verdict, of the algorithms as printed first; two pictures; three doors."""
     text = " ".join("".join(page.text).split())
-    places = [text.index(words) for words in ("What was reproduced", "What was not", "What nobody could know", "Student’s")]
+    order = (
+        "The paper claims",
+        "As printed",
+        "Our improved variant",
+        "published numbers",
+        "The reproduction",
+        "Beyond it",
+        "How it was done",
+    )
+    start = text.index("The paper claims")
+    places = [text.index(words, start) for words in order]
     assert places == sorted(places)
-    first_page = text[: places[-1]]
-    for part in ("one seed", "Feature gap, paper", "sampling time", "Inferred by us", "Chosen by us", "cannot tell"):
-        assert part in first_page
+    html = (written / "report.html").read_text(encoding="utf-8")
+    verdict = re.search(r'<div id="verdict">(.*?)</div>', html, flags=re.DOTALL)[1]
+    assert len(re.findall(r"\w[^\s]*", re.sub(r"<[^>]*>", " ", verdict))) <= 120
+    first = html[html.index('<div id="page-one">') : html.index('<section id="the-reproduction"')]
+    assert first.count("<img") == 2
+
+
+def test_what_is_open_can_be_read_and_what_is_long_is_folded(page, written):
+    assert len(words_of(written, r"<details>.*?</details>")) <= 7000
+    html = re.sub(r"<details>.*?</details>", " ", (written / "report.html").read_text(encoding="utf-8"), flags=re.DOTALL)
+    assert max(body.count("<tr") for body in re.findall(r"<tbody>(.*?)</tbody>", html, flags=re.DOTALL)) <= 15
+    assert len(page.named("details")) == len(page.named("summary")) > 5
+
+
+def test_the_pdf_is_the_same_report_with_the_folds_behind_it(written):
+    assert (written / "report.pdf").read_bytes().startswith(b"%PDF")
+    assert (written / "report.html").stat().st_size < 6e6
 
 
 def test_tables_are_tables_with_headers(page):
     text = " ".join("".join(page.text).split())
-    assert all(f"Table {number}. " in text for number in (1, 2, 3, 4))
+    assert all(f"The paper’s Table {number}" in text for number in (1, 2, 3, 4))
     rows = [inside for tag, _, inside in page.elements if tag == "tr"]
     assert len(page.named("table")) >= 8
     assert all("table" in inside for inside in rows)
@@ -155,6 +216,7 @@ def test_the_report_says_where_it_comes_from_and_that_smoke_means_nothing(writte
     assert origin["scale"] == "smoke"
     assert origin["seeds"] == [0]
     assert sorted(origin["parameters"]) == ["1", "2", "3"]
+    assert sum(row["seconds"] for row in origin["seconds_by_stage"]) == pytest.approx(origin["stage_seconds"])  # of one seed
     for part in (origin["revision"], f"torch {origin['versions']['torch']}", "Its numbers mean nothing", "Errata", "Deviations"):
         assert part in text
 
@@ -164,9 +226,10 @@ def test_the_report_says_where_it_comes_from_and_that_smoke_means_nothing(writte
 
 def test_every_figure_and_table_of_the_paper_has_its_files(written):
     figures = [f"figure_{number}" for number in range(1, 7)]
-    figures += ["network", *(f"{curves}_curves_case_{case}" for curves in ("learning", "online") for case in CASES)]
+    figures += ["network", "comparison", "page_one", *(f"weights_{case}" for case in CASES)]
+    figures += [f"{curves}_curves_case_{case}" for curves in ("learning", "online") for case in CASES]
     assert all((written / "figures" / f"{name}.svg").stat().st_size > 1000 for name in figures)
-    assert [path.name for path in (written / "figures").glob("*.png")] == ["figure_3.png"]  # which README shows
+    assert [path.name for path in sorted((written / "figures").glob("*.png"))] == ["comparison.png", "figure_3.png"]
     for number, ending in product((1, 2, 3, 4), ("csv", "md")):
         assert (written / "tables" / f"table_{number}.{ending}").stat().st_size > 100
     for number in (2, 3, 4):
@@ -178,7 +241,7 @@ def test_every_figure_and_table_of_the_paper_has_its_files(written):
 def test_a_drawing_is_shortened_by_what_no_screen_shows():
     text = '<text style="font-size: 9px; font-family: A, B; fill: #333" x="1.23456" transform="rotate(-0 1.2 3.4)">0.12345</text>'
     short = '<text style="font-size: 9px; fill: #333" x="1.23">0.12345</text>'
-    assert report.shortened(f'<svg width="9.123">\n  {text}</svg>') == f'<svg font-family="A, B" width="9.123">\n{short}</svg>'
+    assert typesetting.shortened(f'<svg width="9.123">\n  {text}</svg>') == f'<svg font-family="A, B" width="9.123">\n{short}</svg>'
 
 
 def test_what_an_older_report_left_is_replaced_and_other_files_stay(written):
@@ -306,13 +369,21 @@ def test_several_seeds_are_compared_by_median_and_intervals(several):
     assert row[["pred_low", "pred_high"]].tolist() == pytest.approx([middle - reach, middle + reach], rel=1e-6)
 
 
-def test_what_went_well_is_said_where_the_limits_were_not_run(results, monkeypatch):
+def rendered(results):
+    origin = report.provenance(results)
+    return typesetting.render(
+        "report.md.jinja", PROJECT / "reports/latest", appendix=None, **report.said(results, report.tabulate(results), origin)
+    )
+
+
+def test_what_went_well_is_said(results, monkeypatch):
     """The smoke run reaches nothing, so the words for better results are asked for."""
-    monkeypatch.setattr(report, "_better", lambda _: {"gap": [1, 2], "worse_as_printed": [2], "online": [1]})
-    text = report.render(results, report.tabulate(results), report.provenance(results))
-    assert "in Case Studies I and II the learned policy lies nearer" in text
-    assert "in Case Study I online learning lifts the objective above the PID's.\n" in text
-    assert "It has its price" not in text
+    monkeypatch.setattr(report, "_better", lambda _: {"gap": [1, 2], "printed": [3], "worse_as_printed": [2], "online": [1]})
+    text = rendered(results)
+    assert "comes as near as the paper says in Case Study III only" in text
+    assert "**Our improved variant** does so in Case Studies I and II" in text
+    assert "beats the PID in Case Study I." in text
+    assert "With a model**, minimum" not in text
 
 
 @pytest.mark.torture
@@ -329,17 +400,17 @@ def test_claims_trials_and_budget_appear_where_they_were_run(results, several):
         made |= origin("04_knowledge_transfer" if case == 3 else "02_offline_irl", case, seed, trial)
         save_stage(folder / f"{'transfer' if case == 3 else 'offline'}_{trial}", made, {"scores.csv": scores})
     results = collect(several, PARAMS, 6)
-    drawn = report.draw(results)
-    assert "online_budget" in drawn
     tabulated = report.tabulate(results)
-    sources = ["published", "reproduced", "interval of median", "interval of one run", "verdict"]
+    drawn = report.draw(results, tabulated["comparison"])
+    assert {"online_budget", "claims"} <= drawn.keys()
+    sources = ["published", "reproduced", "interval of one run", "verdict"]
     assert tabulated["table_3"]["source"].tolist() == sources * 3
     trials = tabulated["trials"].set_index("trial")
     assert trials.loc[trial, "case II, %"] == "12.5 (10.0 to 15.0; 6 seeds)"
     assert list(trials.index) == ["improved", "printed", trial]
     assert {"id", "statement", "verdict", "reason"} <= set(tabulated["claims"])
-    text = report.render(results, tabulated, report.provenance(results))
-    for part in ("with 6 seeds", "95 % bootstrap interval", "# What was tried offline", "# The paper's claims", "# Plant episodes"):
+    text = rendered(results)
+    for part in ("with 6 seeds", "95 % bootstrap interval", "What was tried offline", "# The paper's claims", "# Plant episodes"):
         assert part in text
     assert re.search(r"\bnan\b|\{\{|\{%", text) is None
     for link in re.findall(r"\]\((figures/[^)]+)\)", text):
@@ -420,9 +491,8 @@ def test_seeds_with_missing_stages_are_left_out_only_when_asked_and_the_report_s
         collect(several, PARAMS, 6)
     results = collection.collect(several, PARAMS, "smoke", CASES, 6, missing_allowed=True)
     assert (results.missing, results.n_seeds, set(results.seeds["seed"])) == ((2,), 5, {0, 1, 3, 4, 5})
-    origin = report.provenance(results)
-    assert origin["missing_seeds"] == [2]
-    text = report.render(results, report.tabulate(results), origin)
+    assert report.provenance(results)["missing_seeds"] == [2]
+    text = rendered(results)
     assert "shows 5 of 6 seeds: a stage of seed 2 failed or was not run" in text
     for seed in (0, 1, 3, 4, 5):
         shutil.rmtree(several / f"smoke/seed_{seed}/case_1/demonstrations")
@@ -430,12 +500,13 @@ def test_seeds_with_missing_stages_are_left_out_only_when_asked_and_the_report_s
         collection.collect(several, PARAMS, "smoke", CASES, 6, missing_allowed=True)
 
 
-@pytest.mark.parametrize("broken", ["draw", "tabulate", "render", "typeset"])
+@pytest.mark.parametrize("broken", ["draw", "tabulate", "said", "render", "to_html", "to_pdf"])
 def test_a_report_that_fails_leaves_the_older_one_alone(results, tmp_path, monkeypatch, broken):
-    def fail(*_):
+    def fail(*_, **__):
         raise RuntimeError(broken)
 
-    for name, stand_in in (("draw", lambda _: {}), ("render", lambda *_: ""), (broken, fail)):
+    stand_ins = {"draw": lambda *_: {}, "said": lambda *_: {}, "render": lambda *_, **__: "", "to_html": lambda *_: None}
+    for name, stand_in in (stand_ins | {broken: fail}).items():
         monkeypatch.setattr(report, name, stand_in)
     for old in ("report.html", "figures/figure_3.svg"):
         (tmp_path / old).parent.mkdir(exist_ok=True)

@@ -197,17 +197,14 @@ def test_gaps_of_the_paper_and_of_seeds_that_are_missing():
     assert table[["feature_gap", "expert_error", "online_share"]].isna().all(axis=None)
 
 
-# Lists for the opening page ------------------------------------------------------------------------------------------
+# Counts for the opening page -----------------------------------------------------------------------------------------
 
 
-def test_counts_and_lists_of_verdicts():
+def test_counts_of_verdicts():
     table = compare(seeds())
     counts = scorecard.counts(table)
     assert list(counts) == ["published numbers", "match", "differs", "cannot tell", "fitted"]
     assert counts.to_numpy()[:, 1:].tolist() == [[0, 0, 0, 2], [1, 1, 0, 0], [1, 1, 0, 0]]
-    assert scorecard.listing(table, "differs") == "Case Study IV: features of the policy $h^*$\u2011II; weights $h^*$\u2011II"
-    assert scorecard.listing(table, "fitted") == "Case Study IV: all features of the expert"
-    assert scorecard.listing(table, "cannot tell") == ""
 
 
 def test_features_that_differ_and_lie_nearer_to_the_printed_expert_are_counted():
@@ -268,14 +265,11 @@ def test_claims_are_put_together_over_cases_and_quantities():
     ]
     claims = pd.DataFrame(rows, columns=["id", "case", "quantity", "verdict"]).assign(section="5.1")
     claims["statement"] = "the claim " + claims["id"]
-    assert scorecard.verdicts_of_claims(claims) == {
-        "holds": ["The claim a (5.1)"],
-        "holds in part": [
-            "The claim b (5.1): not for Case Study II",
-            "The claim f (5.1): not for Case Study II (x)",
-            "The claim g (5.1): not for Case Study III (3 of 4 quantities)",
-        ],
-        "does not hold": ["The claim c (5.1)"],
-        "cannot tell": ["The claim d (5.1)"],
-        "not comparable": ["The claim e (5.1)"],
-    }
+    found = scorecard.claims_by_case(claims)
+    assert list(found) == ["section", "statement", "I", "II", "III", "overall", "quantities"]
+    assert found["statement"].tolist() == [f"The claim {name}" for name in "abcdefg"]
+    verdicts = ["holds", "in part", "cannot tell", "cannot tell", "not comparable", "in part", "in part"]
+    assert found["overall"].tolist() == verdicts  # one rule for all sides: c fails in one case as d holds in one
+    assert found.loc[2, ["I", "II", "III"]].tolist() == ["does not hold", "", "cannot tell"]
+    assert found.loc[5, "II"] == "in part"
+    assert found["quantities"].tolist()[5:] == ["1 does not hold, 1 holds", "1 holds, 3 does not hold"]

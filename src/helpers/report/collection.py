@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -19,6 +20,7 @@ OFFLINE = {"offline": HEADLINE, "offline_printed": "printed"}  # stage in seeds.
 REPORT = "05_report"
 INFERRED = "inferred_settings"  # which has no case, and stands with the first seed
 LIMITS = ("attainable", "budget", "quality", "robustness", "safety")  # the parts of notebook 06, the last one written last
+ONE_POLICY, OWN_PLANT = "one_policy", "own_process"  # of notebooks 09 and 07, which are for no case and stand with the first
 SCRATCH = f"offline_{HEADLINE}"  # of a case that starts from another: the same learning without the transfer
 MADE_BY = {"demonstrations": "01", "offline": "02", "online": "03 (04 for the transfer case)", "transfer": "04"}
 
@@ -39,6 +41,7 @@ class Results:
             episodes_per_epoch, objective; trials: trial, family, description, case, seed, gap. Each is empty where it was not run.
         inferred: what notebook 00 wrote, if it was run.
         limits: by case, seed and part of notebook 06, where it was run to its end.
+        one_policy, own_plant: summary.csv of notebook 09 and scores.csv of notebook 07 with a column seed; empty where not run.
         beyond: every stage beyond the paper's own runs, those of claims, budget, trials, limits and inferred settings.
     """
 
@@ -53,6 +56,8 @@ class Results:
     trials: pd.DataFrame
     inferred: Stage | None = None
     limits: Mapping[tuple[int, int, str], Stage] = field(default_factory=dict)
+    one_policy: pd.DataFrame = field(default_factory=pd.DataFrame)
+    own_plant: pd.DataFrame = field(default_factory=pd.DataFrame)
     beyond: tuple[Stage, ...] = ()
     made_from: Mapping[str, str] = field(default_factory=dict)
     missing: tuple[int, ...] = ()
@@ -74,8 +79,12 @@ class Results:
 
     def median(self, case: int, stage: str, metric: str) -> float:
         """The median of one number over the seeds; nan where no seed gave it."""
-        rows = self.medians.query("case == @case and stage == @stage and metric == @metric")
-        return float(rows["median"].iloc[0]) if len(rows) else float("nan")
+        return self._by_number.get((case, stage, metric), float("nan"))
+
+    @cached_property
+    def _by_number(self) -> dict[tuple[int, str, str], float]:
+        found: dict[tuple[int, str, str], float] = self.medians.set_index(scorecard.KEYS)["median"].to_dict()
+        return found
 
     def offline_folder(self, case: int, variant: str = HEADLINE) -> str:
         """The folder of a case's offline learning."""
@@ -135,8 +144,10 @@ def collect(
     path = root / scale / "seed_0" / INFERRED
     inferred = load_stage(path, "notebook 00") if (path / RECORD).is_file() else None
     limits = _limits(root / scale, cases, seeds_found)
-    tried = (stage for found in trials.values() for stage in found.values())
-    beyond = (*experiments.values(), *budget.values(), *tried, *limits.values(), *([inferred] if inferred else []))
+    one_policy = _finished(root / scale, (1,), seeds_found, ONE_POLICY, "notebook 09")
+    own_plant = _finished(root / scale, (1,), seeds_found, OWN_PLANT, "notebook 07")
+    parts: tuple[Mapping[Any, Stage], ...] = (one_policy, own_plant, experiments, budget, *trials.values(), limits)
+    beyond = (*(stage for part in parts for stage in part.values()), *([inferred] if inferred else []))
     check([*stages.values(), *beyond], root / scale, params_root)
     known = claims.load_claims(params_root) if experiments else {}
     claim_values = claims.collect(known, stages | {(*place, EXPERIMENTS): stage for place, stage in experiments.items()})
@@ -152,6 +163,8 @@ def collect(
         trials=_trials(params, seeds, trials),
         inferred=inferred,
         limits=limits,
+        one_policy=_all_of(one_policy, "summary.csv"),
+        own_plant=_all_of(own_plant, "scores.csv"),
         beyond=beyond,
         made_from=inputs(REPORT, params_root, scale),
         missing=tuple(seed for seed in range(n_seeds) if seed not in seeds_found),
@@ -181,6 +194,12 @@ def _limits(root: Path, cases: tuple[int, ...], seeds: Sequence[int]) -> dict[tu
         folder = root / f"seed_{seed}" / f"case_{case}"
         found |= {(case, seed, part): load_stage(folder / f"limits_{part}", "notebook 06") for part in LIMITS}
     return found
+
+
+def _all_of(found: Mapping[tuple[int, int], Stage], name: str) -> pd.DataFrame:
+    """One table of every stage, with a column seed; empty without any."""
+    frames = [stage.table(name).assign(seed=seed) for (_, seed), stage in found.items()]
+    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
 
 
 def _budget(found: Mapping[tuple[int, int], Stage]) -> pd.DataFrame:

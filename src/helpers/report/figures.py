@@ -95,23 +95,26 @@ def control_figure(
     descriptions: Mapping[str, str] | None = None,
     agent_label: str = r"agent $\pi^A$, after online learning",
     expert_label: str = r"PID $\pi^E$",
-    zoom_from: int = 5,
+    zoom_from: int | None = 5,
+    size: tuple[float, float] | None = None,
 ) -> Figure:
     """Figures 3, 5 and 6: a column for each loop; response and control above, zoomed response below.
 
     Response and control have axes of their own that share the time axis, so that no scale can be mistaken for another.
-    The zoom leaves out the first samples, which are the way to the set point. The band of an input that often sits at
-    a bound can pass it: it is a standard deviation, not a range.
+    The zoom leaves out the first samples, which are the way to the set point, and the bands, which would fill it. The band of an
+    input that often sits at a bound can pass it: it is a standard deviation, not a range.
 
     Args:
         response: columns of `stages.response_table`, and `seed` where there are several runs.
         set_point: of each loop, deviation variables.
         descriptions: of variables in words, by name.
-        zoom_from: first sample of the zoom.
+        zoom_from: first sample of the zoom; None: no zoom.
+        size: width and height in inches, where the figure is not as wide as the report.
     """
     n_loops = len(controlled)
-    figure = empty_figure(max(WIDTH, WIDTH / 2 * n_loops), 8.2)
-    grid = figure.add_gridspec(3, n_loops, height_ratios=(6, 4, 6))
+    heights = (6, 4) if zoom_from is None else (6, 4, 6)
+    figure = empty_figure(*(size or (max(WIDTH, WIDTH / 2 * n_loops), 8.2)))
+    grid = figure.add_gridspec(len(heights), n_loops, height_ratios=heights)
     words = descriptions or {}
     for loop, (output, entry, target) in enumerate(zip(controlled, manipulated, set_point, strict=True)):
         axes = figure.add_subplot(grid[0, loop])
@@ -122,10 +125,11 @@ def control_figure(
         _draw_response(below, response, entry)
         _finish(below, "", entry, words)
         below.set_xlabel(TIME_LABEL)
-        zoom = figure.add_subplot(grid[2, loop])
-        _draw_response(zoom, response[response["time_index"] >= zoom_from], output, target)
-        _finish(zoom, ascii_uppercase[n_loops + loop], output, words, zoom_from)
-        zoom.set_xlabel(TIME_LABEL)
+        if zoom_from is not None:
+            zoom = figure.add_subplot(grid[2, loop])
+            _draw_response(zoom, response[response["time_index"] >= zoom_from], output, target, with_band=False)
+            _finish(zoom, ascii_uppercase[n_loops + loop], output, words, zoom_from)
+            zoom.set_xlabel(TIME_LABEL)
     figure.align_ylabels()
     _legend(figure, response, ("controlled", "manipulated"), agent_label, expert_label)
     return figure
@@ -299,7 +303,9 @@ def lay_out(figure: Figure) -> None:
         figure.set_layout_engine(None)
 
 
-def _draw_response(axes: Axes, response: pd.DataFrame, variable: str, set_point: float | None = None) -> None:
+def _draw_response(
+    axes: Axes, response: pd.DataFrame, variable: str, set_point: float | None = None, with_band: bool = True
+) -> None:
     """Mean and band of one variable under expert and agent; an input is drawn as held until the next sample.
 
     Of several runs the medians of mean and standard deviation at each sample, and the mean of each run as a thin line.
@@ -318,9 +324,9 @@ def _draw_response(axes: Axes, response: pd.DataFrame, variable: str, set_point:
         _draw_singles(axes, rows, "time_index", "mean", colour, held=bool(held))
         middle = rows.groupby("time_index")[["mean", "std"]].median()
         time, mean, std = middle.index.to_numpy(), middle["mean"].to_numpy(), middle["std"].to_numpy()
-        axes.fill_between(
-            time, mean - std, mean + std, color=colour, alpha=BAND_OPACITY, linewidth=0, label=f"{label}: {BAND}", **held
-        )
+        if with_band:
+            look: Any = {"color": colour, "alpha": BAND_OPACITY, "linewidth": 0, "label": f"{label}: {BAND}"}
+            axes.fill_between(time, mean - std, mean + std, **look, **held)
         steps = "steps-post" if held else "default"
         axes.plot(time, mean, color=colour, linestyle=LINE_STYLES[controller], drawstyle=steps, label=label)
     limits = [response["time_index"].min(), response["time_index"].max()]
@@ -389,7 +395,8 @@ def _legend(figure: Figure, response: pd.DataFrame, kinds: Sequence[str], agent_
     band = Patch(facecolor="#888888", alpha=0.35, label=f"line and band: {BAND}{over}")
     # A legend fills column by column: one for the outputs, one for the inputs, where there are both.
     handles = [*handles[:2], *below, *handles[2:], band]
-    figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
+    narrow: Any = {"fontsize": 8, "labelspacing": 0.2} if figure.get_figwidth() < WIDTH else {}
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False, **narrow)
 
 
 def _percent(share: float, position: int | None = None) -> str:

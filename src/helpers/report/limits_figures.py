@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
@@ -13,6 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from seaborn import heatmap
 
 from helpers.report.figures import INK, KIND_STYLES, LOOP_COLOURS, MUTED, WIDTH, empty_figure
+from helpers.report.tables import ROMAN
 
 LABELS = {
     "expert": "PID (demonstrator)",
@@ -20,10 +22,10 @@ LABELS = {
     "online": "online policy",
     "online_there": "improved on that plant",
     "clone": "cloning",
-    "irl_reinforce": "IRL, then REINFORCE",
-    "clone_reinforce": "cloning, then REINFORCE",
-    "csil_reinforce": "CSIL, then REINFORCE",
-    "scratch_reinforce": "REINFORCE from scratch",
+    "irl_reinforce": "IRL, then policy gradient",
+    "clone_reinforce": "cloning, then policy gradient",
+    "csil_reinforce": "CSIL, then policy gradient",
+    "scratch_reinforce": "policy gradient from scratch",
     "ppo": "PPO from scratch",
     "recurrent_ppo": "RecurrentPPO from scratch",
     "pid_tuned": "PID, tuned",
@@ -48,8 +50,11 @@ LEARNERS = (
     "pid_tuned",
     "pid_scheduled",
 )
+THE_PAPERS = "irl_reinforce"
+RIVALS = tuple(name for name in LEARNERS if name != THE_PAPERS)  # they need no model
 LEVELS = ("one_policy", "mpc", "minimum_variance", "expert", "dynamic_programme")
 RUNS = {"hot": "hot start", "cloned": "from the clone", "scratch": "from scratch"}
+NOTHING = "#c8c8c8"  # under a condition in which no controller earns anything
 GRIDS = {  # of each group of conditions: title, label of the rows, label of the columns
     "model": ("mismatch of the model", "A, times", "B, times"),
     "noise": ("disturbance and observation noise", "disturbance, times", "observation noise, times"),
@@ -58,25 +63,31 @@ GRIDS = {  # of each group of conditions: title, label of the rows, label of the
 }
 
 
-def gap_figure(gaps: pd.DataFrame) -> Figure:
-    """The gap of every controller to the dynamic programme with its 95 % interval; a panel for each beta.
+def gap_figure(gaps: pd.DataFrame, panel: str = "beta") -> Figure:
+    """The gap of every controller to the dynamic programme with its 95 % interval; a panel for each beta or case.
 
     Args:
-        gaps: columns beta, controller, gap, gap_low, gap_high, in per cent.
+        gaps: columns beta or case, controller, gap, gap_low, gap_high, in per cent.
+        panel: the column that tells the panels apart.
     """
-    betas = sorted(gaps["beta"].unique())
+    values = sorted(gaps[panel].unique())
     figure = empty_figure(WIDTH, 0.6 + 0.27 * gaps["controller"].nunique())
-    for index, (beta, axes) in enumerate(zip(betas, np.atleast_1d(figure.subplots(1, len(betas), sharey=True)), strict=True)):
-        rows = gaps[gaps["beta"] == beta].set_index("controller")
-        rows = rows.reindex([name for name in LABELS if name in rows.index])[::-1]
+    listed = [name for name in LABELS if name in set(gaps["controller"])][::-1]
+    for index, (value, axes) in enumerate(zip(values, np.atleast_1d(figure.subplots(1, len(values), sharey=True)), strict=True)):
+        rows = gaps[gaps[panel] == value].set_index("controller").reindex(listed)
         reach = np.stack([rows["gap"] - rows["gap_low"], rows["gap_high"] - rows["gap"]])
         axes.errorbar(rows["gap"], range(len(rows)), xerr=reach, fmt="o", color=INK, markersize=4, label="gap and 95 % interval")
         axes.axvline(0, color=MUTED, linewidth=1)
         axes.set_yticks(range(len(rows)), [LABELS[name] for name in rows.index])
         axes.set_xlabel("gap to the programme (%)")
-        axes.set_title(f"$\\mathbf{{{ascii_uppercase[index]}}}$  $\\beta = {beta:g}$", loc="left")
-        axes.set_label(f"{ascii_uppercase[index]} beta {beta:g}")
+        title = f"$\\beta = {value:g}$" if panel == "beta" else _case(value)
+        axes.set_title(f"$\\mathbf{{{ascii_uppercase[index]}}}$  {title}", loc="left")
+        axes.set_label(f"{ascii_uppercase[index]} {panel} {value:g}")
     return figure
+
+
+def _case(case: int) -> str:
+    return f"Case Study {ROMAN[case - 1]}"
 
 
 def budget_curves(curves: pd.DataFrame, levels: Mapping[str, float]) -> Figure:
@@ -88,7 +99,33 @@ def budget_curves(curves: pd.DataFrame, levels: Mapping[str, float]) -> Figure:
         levels: objectives of controllers that do not learn.
     """
     figure = empty_figure(WIDTH, 4.4)
-    axes = figure.subplots()
+    _draw_budget(axes := figure.subplots(), curves, levels)
+    axes.set_label("budget")
+    figure.legend(loc="outside right upper", frameon=False)
+    return figure
+
+
+def budget_by_case(curves: pd.DataFrame, levels: Mapping[int, Mapping[str, float]]) -> Figure:
+    """`budget_curves` of each case, side by side.
+
+    Args:
+        curves: with a column case.
+        levels: by case.
+    """
+    figure = empty_figure(WIDTH, 4.2)
+    panels = np.atleast_1d(figure.subplots(1, len(levels)))
+    for axes, (case, of_case) in zip(panels, levels.items(), strict=True):
+        _draw_budget(axes, curves[curves["case"] == case], of_case)
+        axes.set_title(_case(case), loc="left")
+        axes.set_ylabel(axes.get_ylabel() if axes is panels[0] else "")
+        axes.set_label(f"budget {case}")
+        axes.xaxis.set_major_locator(MaxNLocator(3, integer=True))
+    known = {line.get_label(): line for axes in panels for line in axes.lines}
+    figure.legend(handles=list(known.values()), loc="outside lower center", ncols=3, frameon=False)
+    return figure
+
+
+def _draw_budget(axes: Axes, curves: pd.DataFrame, levels: Mapping[str, float]) -> None:
     markers = "osv^D*PX"
     names = [name for name in LEARNERS if name in set(curves["learner"])]
     for index, name in enumerate(names):
@@ -105,13 +142,12 @@ def budget_curves(curves: pd.DataFrame, levels: Mapping[str, float]) -> Figure:
     axes.set_xlabel("plant episodes spent")
     axes.set_ylabel("tracking objective $J$ on $x$ (no unit)")
     axes.set_ylim(bottom=0)
-    axes.set_label("budget")
-    figure.legend(loc="outside right upper", frameon=False)
-    return figure
 
 
 def heat_maps(robustness: pd.DataFrame, group: str, controllers: Sequence[str]) -> Figure:
-    """A heat map for each controller: its objective under every condition, coloured by its share of the PID's there.
+    """A heat map for each controller: its objective under every condition, coloured by what it has ahead of the PID.
+
+    The colour is the difference to the PID's objective in per cent of the best controller's there; grey: none earns anything.
 
     Args:
         robustness: columns group, row, column, controller, objective.
@@ -124,21 +160,51 @@ def heat_maps(robustness: pd.DataFrame, group: str, controllers: Sequence[str]) 
     across = 3
     down = -(-len(controllers) // across)
     figure = empty_figure(WIDTH, 0.9 + down * (0.55 + 0.26 * len(rows)))
-    norm, colours = TwoSlopeNorm(100, 40, 160), "PuOr"
+    best = table.groupby("row").max().loc[rows, columns]
+    norm, colours = TwoSlopeNorm(0, -100, 100), "PuOr"  # no value can lie beyond
     for index, name in enumerate(controllers):
         axes = figure.add_subplot(down, across, index + 1)
         values = table.loc[name].loc[rows, columns]
         look: Any = {"cmap": colours, "norm": norm, "cbar": False, "annot_kws": {"fontsize": 7.5}}
-        heatmap(100 * values / reference, annot=values, fmt=".1f", ax=axes, **look)
-        axes.set(xlabel="", ylabel="")
+        heatmap(100 * (values - reference) / best, annot=values, fmt=".1f", ax=axes, **look)
+        axes.set(xlabel="", ylabel="", facecolor=NOTHING)
         axes.tick_params(labelbottom=index >= len(controllers) - across, labelleft=index % across == 0, labelrotation=0)
         axes.set_title(LABELS[name], fontsize=9, loc="left")
         axes.set_label(f"{name} {group}")
     figure.supxlabel(column_label, fontsize=10)
     figure.supylabel(row_label, fontsize=10)
-    bar = figure.colorbar(ScalarMappable(norm, colours), ax=figure.axes, shrink=0.8, aspect=30, extend="both")
-    bar.set_label("$J$, % of the PID's there")
+    bar = figure.colorbar(ScalarMappable(norm, colours), ax=figure.axes, shrink=0.8, aspect=30)
+    bar.set_label("$J$ less the PID's, % of the best there")
     figure.suptitle(f"{title[:1].upper()}{title[1:]}: $J$ on $x$ of each controller", fontsize=10.5, x=0.02, ha="left")
+    return figure
+
+
+def robustness_figure(shares: pd.DataFrame, groups: Mapping[str, str]) -> Figure:
+    """The least share of the PID's objective over each grid of conditions: a panel for each case, a row for each controller.
+
+    Args:
+        shares: `limits_report.worst`: columns case, seed, controller, group, value (per cent).
+        groups: words for the grids.
+    """
+    medians = shares.groupby(["case", "controller", "group"])["value"].median().to_dict()
+    cases = sorted(shares["case"].unique())
+    names = [name for name in LABELS if name in set(shares["controller"])]
+    figure = empty_figure(WIDTH, 1.2 + 0.24 * len(names))
+    panels = np.atleast_1d(figure.subplots(1, len(cases), sharey=True))
+    shapes = "osD^v*"
+    for axes, case in zip(panels, cases, strict=True):
+        for index, (group, words) in enumerate(groups.items()):
+            points = [(medians[case, name, group], -y) for y, name in enumerate(names) if (case, name, group) in medians]
+            if points:
+                look: Any = {"color": LOOP_COLOURS[index], "marker": shapes[index], "markersize": 5, "linestyle": ""}
+                axes.plot(*zip(*points, strict=True), label=words, **look)
+        axes.axvline(100, color=MUTED, linewidth=1, linestyle=KIND_STYLES[1])
+        axes.set_title(_case(case), loc="left")
+        axes.set_xlabel("% of the PID's $J$ there")
+        axes.set_xlim(left=0)
+        axes.set_label(f"case {case}")
+    panels[0].set_yticks([-y for y in range(len(names))], [LABELS[name] for name in names])
+    figure.legend(handles=panels[0].lines[: len(set(shares["group"]))], loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 

@@ -1,7 +1,6 @@
 """The section of the report on limits and alternatives, where notebook 06 was run: its tables and figures, and what they say."""
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -10,13 +9,26 @@ from scipy.optimize import lsq_linear
 
 from helpers.report import scorecard
 from helpers.report.collection import Results
-from helpers.report.limits_answer import NO_LEARNERS, WITH_MODEL, answer
-from helpers.report.limits_figures import GRIDS, LABELS, LEARNERS, RUNS, budget_curves, gap_figure, heat_maps
-from helpers.report.statistics import FEWEST, median_interval
+from helpers.report.limits_figures import (
+    GRIDS,
+    LABELS,
+    RIVALS,
+    RUNS,
+    THE_PAPERS,
+    budget_by_case,
+    gap_figure,
+    heat_maps,
+    robustness_figure,
+)
 from helpers.report.tables import NOT_KNOWN, ROMAN, spread, symbol
 from helpers.settings.paper import Params
 
 PLACES = 4  # digits after the point that count
+WITHOUT_THE_PLANT = {  # columns of notebook 09's summary, all shares of minimum variance
+    "Of minimum variance, %": "share",
+    "Least at other set points, %": "set points, least",
+    "Least at corners of the models, %": "corners, least",
+}
 NEVER = 1e9  # stands for a time that a response never came to, so that it counts as long
 # Of each table of control quality its figures: header with unit, factor, digits after the point.
 QUALITY: dict[str, dict[str, tuple[str, int, int]]] = {
@@ -49,10 +61,6 @@ SAFETY = {  # of the online epochs, with their units
     "regret_peak": "Greatest on the way ($J$)",
 }
 GROUPS = {"model": "model", "noise": "noise", "set_point": "set points", "time": "dead time and load"}
-THE_PAPERS = "irl_reinforce"
-RIVALS = tuple(name for name in LEARNERS if name != THE_PAPERS)  # they need no model
-TUNED = 1.05  # of the objective it began with, for a search to have found other gains
-END_IN_REINFORCE = ("online", "irl_reinforce", "clone_reinforce", "csil_reinforce", "scratch_reinforce")
 
 
 def read(results: Results, part: str, name: str) -> pd.DataFrame:
@@ -88,8 +96,30 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     } | ({"limits_curves": budget} if len(budget) else {})
 
 
-def sharpest(results: Results, gaps: pd.DataFrame) -> pd.DataFrame:
+def without_the_plant(results: Results) -> dict[str, pd.DataFrame]:
+    """What notebooks 09 (one policy) and 07 (your own process) came to, medians over seeds, where they were run."""
+    found = {}
+    if len(results.one_policy):
+        rows = results.one_policy.assign(controller=pd.Categorical(results.one_policy["controller"], list(LABELS)))
+        medians = rows.groupby(["case", "controller"], observed=True).median(numeric_only=True).reset_index()
+        shown = {"case": medians["case"].map(lambda case: ROMAN[case - 1]), "controller": medians["controller"].map(LABELS)}
+        shown["$J$"] = medians["J(30)"].map("{:.1f}".format)
+        for name, column in WITHOUT_THE_PLANT.items():
+            shown[name] = (100 * medians[column]).map("{:.0f}".format).replace("nan", NOT_KNOWN)
+        found["one_policy"] = pd.DataFrame(shown)
+    if len(results.own_plant):
+        figures, place = ["mean |e|", "movement"], ["seed", "controller"]
+        means = results.own_plant.groupby(place, sort=False)[figures].mean()
+        shares = (100 * means / means.xs("PID of the record", level="controller")).groupby("controller", sort=False).median()
+        table = shares.map("{:.0f}".format).rename(columns=lambda name: f"{name[:1].upper()}{name[1:]}, % of the record's PID")
+        offsets = results.own_plant.groupby(place, sort=False)["offset"].max().groupby("controller", sort=False).median()
+        found["own_plant"] = table.assign(**{"Greatest offset, % of the range": (100 * offsets).map("{:.1f}".format)}).reset_index()
+    return found
+
+
+def sharp_gaps(results: Results) -> pd.DataFrame:
     """The gaps under the headline beta of their case."""
+    gaps = read(results, "attainable", "gaps.csv")
     return gaps[gaps["beta"] == gaps["case"].map(lambda case: results.params[case].case.online.headline_beta)]
 
 
@@ -269,253 +299,28 @@ def _labelled(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def draw(results: Results) -> dict[str, Figure]:
-    """The figures of the section by name, for each case that notebook 06 was run for."""
-    curves, gaps = read(results, "budget", "curves.csv"), read(results, "attainable", "gaps.csv")
+    """The figures of the section by name, where notebook 06 was run: all cases in one, and a heat map for each grid and case."""
+    if read(results, "attainable", "gaps.csv").empty:
+        return {}
+    sharp = sharp_gaps(results)
+    levels = {int(case): rows.groupby("controller")["objective"].median() for case, rows in sharp.groupby("case")}
+    shown = _with_interval(sharp, "gap", ("gap_low", "gap_high"))
+    shown = shown.rename(columns={"median": "gap", "ci_low": "gap_low", "ci_high": "gap_high"})
+    drawn = {
+        "limits_budget": budget_by_case(read(results, "budget", "curves.csv"), levels),
+        "limits_gaps": gap_figure(shown, "case"),
+        "limits_robustness": robustness_figure(worst(results), GROUPS),
+    }
     robust, place = read(results, "robustness", "robustness.csv"), ["group", "row", "column", "controller"]
-    drawn = {}
-    for case in sorted(gaps["case"].unique()) if len(gaps) else ():
-        own = gaps[gaps["case"] == case]
-        levels = sharpest(results, own).groupby("controller")["objective"].median()
-        drawn[f"limits_budget_case_{case}"] = budget_curves(curves[curves["case"] == case], levels)
-        shown = _with_interval(own, "gap", ("gap_low", "gap_high"))
-        shown = shown.rename(columns={"median": "gap", "ci_low": "gap_low", "ci_high": "gap_high"})
-        drawn[f"limits_gaps_case_{case}"] = gap_figure(shown)
-        cells = robust[robust["case"] == case].groupby(place, as_index=False, sort=False)["objective"].median()
-        for group in GRIDS if len(cells) else ():
-            if group in set(cells["group"]):
-                drawn[f"limits_{group}_case_{case}"] = heat_maps(cells, group, list(cells["controller"].unique()))
+    for name in heat_map_names(results):
+        group, _, case = name.removeprefix("limits_").rpartition("_case_")
+        cells = robust[robust["case"] == int(case)].groupby(place, as_index=False, sort=False)["objective"].median()
+        drawn[name] = heat_maps(cells, group, list(cells["controller"].unique()))
     return drawn
 
 
-# What the numbers say over cases and seeds, for the words of the report; every number comes from the tables.
-
-
-def find(results: Results) -> dict[str, Any]:
-    """What the section says, by the name of the function below that found it; nothing where notebook 06 was not run."""
-    if read(results, "attainable", "gaps.csv").empty:
-        return {}
-    learning = (seeds, attainable, agreement, answers, standings, tuned, visited, practice, not_found)
-    parts = (*learning, ranges, left_out, there, out_of_reach, price)
-    return {part.__name__: part(results) for part in parts}
-
-
-def seeds(results: Results) -> dict[int, int]:
-    """How many seeds there are of each case."""
-    found: dict[int, int] = read(results, "attainable", "gaps.csv").groupby("case")["seed"].nunique().to_dict()
-    return found
-
-
-def attainable(results: Results) -> dict[int, dict[str, float]]:
-    """By case, medians in per cent of the programme's objective.
-
-    look_ahead: what it gains over one-step control; noise: what it loses behind a filter; filter: what filtering gives one-step
-    control on y.
-    """
-    gaps = _sharp(results).pivot_table(index="case", columns="controller", values="gap", aggfunc="median")
-    return {
-        int(case): {
-            "look_ahead": row["minimum_variance_x"],
-            "noise": row["dynamic_programme_filtered"],
-            "filter": row["minimum_variance"] - row["minimum_variance_filtered"],
-        }
-        for case, row in gaps.iterrows()
-    }
-
-
-def _sharp(results: Results) -> pd.DataFrame:
-    return sharpest(results, read(results, "attainable", "gaps.csv"))
-
-
-def agreement(results: Results) -> float:
-    """The largest difference between the programme's value and that of its policy by Monte Carlo, in per cent."""
-    grids = read(results, "attainable", "grids.csv").drop_duplicates(["case", "seed", "beta"], keep="last")
-    return 100 * float(grids["difference"].abs().max())
-
-
-def answers(results: Results) -> dict[int, str]:
-    """What a practitioner can read off, a sentence or two for each case that notebook 06 was run for.
-
-    Off the medians; with as many seeds as make an interval, learners are compared within seeds, and those that cannot be told
-    apart from the best are named.
-    """
-    gaps, budget = _sharp(results), read(results, "budget", "budget.csv")
-    found = {}
-    for case, own in gaps.groupby("case"):
-        listed = budget[budget["case"] == case].drop(columns="case").set_index(["seed", "learner"]).rename(columns=int)
-        listed = listed[[episodes for episodes in listed if episodes]]  # nobody has learned from none
-        if own["seed"].nunique() < FEWEST:
-            medians = listed.groupby("learner", sort=False).median()
-            found[int(case)] = answer(own.groupby("controller")[["objective", "gap"]].median(), medians)
-        else:
-            found[int(case)] = _answer_over_seeds(own, listed)
-    return found
-
-
-def standings(results: Results) -> dict[int, dict[str, dict[str, list[int]]]]:
-    """By budget and rival: the cases in which the paper's learner is ahead of it, behind it, or where the seeds cannot tell.
-
-    Cases with too few seeds for an interval are left out.
-    """
-    found: dict[int, dict[str, dict[str, list[int]]]] = {}
-    for row in summary(ahead(listed_budgets(results))).dropna(subset="ci_low").itertuples():
-        word = "ahead" if row.ci_low > 0 else "behind" if row.ci_high < 0 else "not to be told apart"
-        found.setdefault(row.metric, {}).setdefault(row.stage, {}).setdefault(word, []).append(row.case)
-    return dict(sorted(found.items()))
-
-
-def tuned(results: Results) -> dict[int, dict[str, float]]:
-    """By case, how the searches for gains of the PID ended: in how many seeds above `TUNED`, and the range of the objective."""
-    curves = read(results, "budget", "curves.csv").query("learner == 'pid_tuned'").sort_values("episodes")
-    found = {}
-    for case, rows in curves.groupby("case"):
-        ends = rows.groupby("seed")["objective"].agg(["first", "last"])
-        better = int((ends["last"] > TUNED * ends["first"]).sum())
-        found[int(case)] = {"better": better, "seeds": len(ends), "least": ends["last"].min(), "greatest": ends["last"].max()}
-    return found
-
-
-def visited(results: Results) -> list[int]:
-    """After how many episodes the tuned PID was judged last before each listed budget."""
-    spent = read(results, "budget", "curves.csv").query("learner == 'pid_tuned'")["episodes"]
-    budgets = sorted(set(listed_budgets(results)["metric"].astype(int)))
-    return [int(spent[spent <= budget].max()) for budget in budgets if budget]
-
-
-def practice(results: Results) -> dict[str, Any]:
-    """What helps to choose.
-
-    model_ahead: the cases in which minimum variance on y lies above every learner at the last budget; never_below: the controllers
-    that no condition puts below the PID; least: the range of what those that end in REINFORCE keep of the PID's objective at other
-    set points, in per cent; without_model: by budget the best that needs none, with its cases. All in the median.
-    """
-    listed = listed_budgets(results).astype({"metric": int})
-    medians = listed.groupby(["case", "metric", "learner"])["value"].median()
-    reached = _sharp(results).groupby(["case", "controller"])["objective"].median()
-    model_ahead: list[int] = []
-    without_model: dict[int, dict[str, list[int]]] = {}
-    for (case, budget), row in medians.unstack("learner").iterrows():  # noqa: PD010
-        if budget == max(listed["metric"]) and reached[case, "minimum_variance"] > row.reindex(LEARNERS).max():
-            model_ahead.append(int(case))
-        if budget and (others := row.reindex(RIVALS).dropna()).size:
-            without_model.setdefault(int(budget), {}).setdefault(LABELS[others.idxmax()], []).append(int(case))
-    shares = worst(results)
-    kept = shares.pivot_table(index="controller", columns=["case", "group"], values="value", aggfunc="median").drop(index="expert")
-    points = shares[(shares["group"] == "set_point") & shares["controller"].isin(END_IN_REINFORCE)]
-    least = points.groupby(["case", "controller"])["value"].median()
-    return {
-        "model_ahead": model_ahead,
-        "never_below": [LABELS[name] for name in LABELS if name in kept.index and (kept.loc[name] >= 100).all()],
-        "least": (least.min(), least.max()),
-        "without_model": without_model,
-    }
-
-
-def not_found(results: Results) -> dict[int, list[str]]:
-    """By case, the learners with a loop whose mean response comes to no 90 % of the change in most seeds, and that loop."""
-    quality = read(results, "quality", "quality.csv")
-    rises = quality[quality["figure"].str.startswith("rise_time:") & quality["controller"].isin(LEARNERS)]
-    missed = rises.assign(missed=rises["value"].isna()).groupby(["case", "controller", "figure"], sort=False)["missed"].mean()
-    found: dict[int, list[str]] = {}
-    for case, controller, figure in missed[missed > 0.5].index:
-        found.setdefault(int(case), []).append(f"{LABELS[controller]} ({symbol(figure.partition(':')[2])})")
-    return found
-
-
-def ranges(results: Results) -> str:
-    """What the grids of conditions span, in words."""
-    robust = read(results, "robustness", "robustness.csv")
-    words = {
-        "model": "A and B times {} and {}",
-        "noise": "disturbance times {} and observation noise times {}",
-        "set_point": "the set points of the two loops times {} and {}",
-        "time": "dead time of {} samples and a load step of {} of the set point change per sample",
-    }
-    spans = robust.astype({"row": float, "column": float}).groupby("group")[["row", "column"]].agg(["min", "max"])
-    found = []
-    for group, text in words.items():
-        if group in spans.index:
-            ends = spans.loc[group]
-            found.append(text.format(*(f"{ends[axis, 'min']:g} to {ends[axis, 'max']:g}" for axis in ("row", "column"))))
-    return "; ".join(found)
-
-
-def left_out(results: Results) -> dict[str, dict[int, tuple[int, int]]]:
-    """By group and case, how many of how many conditions were left out because no input within the bounds holds the set point."""
-    robust = read(results, "robustness", "robustness.csv")
-    place = ["case", "group", "row", "column"]
-    total = robust[place].drop_duplicates().groupby(["group", "case"]).size()
-    out = unholdable(results).groupby(["group", "case"]).size()
-    found: dict[str, dict[int, tuple[int, int]]] = {}
-    for (group, case), count in out.items():
-        found.setdefault(group, {})[int(case)] = (int(count), int(total[group, case]))
-    return found
-
-
-def out_of_reach(results: Results) -> dict[str, list[int]]:
-    """By mismatched plant that was improved on, the cases of which no input within the bounds holds the set point there."""
-    out = unholdable(results).query("group == 'model'")
-    out = out.assign(plant=plant_names(out["row"].astype(float), out["column"].astype(float)))
-    found: dict[str, list[int]] = out[out["plant"].isin(on_mismatch(results)["plant"])].groupby("plant")["case"].agg(list).to_dict()
-    return found
-
-
-def there(results: Results) -> dict[str, dict[int, list[str]]]:
-    """By mismatched plant and case, the controllers that improving on that plant is not ahead of.
-
-    By the whole interval of the difference within seeds; nothing for too few seeds.
-    """
-    every = on_mismatch(results)
-    found: dict[str, dict[int, list[str]]] = {}
-    for (plant, case), rows in every.groupby(["plant", "case"], sort=False):
-        reached = rows.pivot_table(index="seed", columns="controller", values="objective")
-        if len(reached) >= FEWEST:
-            others = [name for name in LABELS if name in reached and name != "online_there"]
-            behind = [LABELS[name] for name in others if _low(reached["online_there"] - reached[name]) <= 0]
-            found.setdefault(plant, {})[int(case)] = behind
-    return found
-
-
-def price(results: Results) -> dict[int, dict[str, float]]:
-    """What online improvement costs in each case, in per cent and medians over seeds.
-
-    worse: the exploring episodes that were worse than the PID; set_point and model: the least share of the PID's objective that
-    the improved policy reaches at set points not trained on and on plants that are not the model, where the bounds allow it.
-    """
-    safety = read(results, "safety", "safety.csv")
-    worse = 100 * safety[safety["run"] == "hot"].groupby("case")["worse"].median()
-    online = worst(results).query("controller == 'online'")
-    kept = online.pivot_table(index="case", columns="group", values="value", aggfunc="median")
-    return kept.reindex(columns=["set_point", "model"]).assign(worse=worse).to_dict("index")
-
-
-def _answer_over_seeds(own: pd.DataFrame, listed: pd.DataFrame) -> str:
-    """Who learns best, who cannot be told apart from it, and who passes the controllers that have the exact model instead.
-
-    Args:
-        own: columns seed, controller, objective, gap, of one case and beta.
-        listed: the objective after so many episodes (columns), index seed and learner.
-    """
-    best, passing = [], []
-    for episodes in listed:
-        reached = listed.pivot_table(index="seed", columns="learner", values=episodes)
-        learners = reached.drop(columns=list(NO_LEARNERS), errors="ignore")
-        first = learners.median().idxmax()
-        ahead = {name: _low(learners[first] - learners[name]) for name in learners if name != first}
-        tied = ", ".join(LABELS[name] for name, low in ahead.items() if low <= 0)
-        apart = f"not to be told apart from {tied}" if tied else "ahead of all others"
-        best.append(f"after {episodes:,} episodes {LABELS[first]}, $J$ = {learners[first].median():.1f} ({apart})")
-        passed = [LABELS[name] for name in learners if _low(learners[name] - reached["mpc"]) > 0]
-        passing.append(f"after {episodes:,} {', '.join(passed) or 'none'}")
-    medians = own.groupby("controller")[["objective", "gap"]].median()
-    model = medians.reindex(WITH_MODEL).dropna()
-    known = ", ".join(f"{LABELS[name]} {row['objective']:.1f} ({row['gap']:.1f} %)" for name, row in model.iterrows())
-    return (
-        f"**Learning on the plant**, best in the median: {'; '.join(best)}. **With the exact model** and no episode at all (in "
-        f"brackets the gap to the programme): {known}; the demonstrator stands {medians['gap']['expert']:.1f} % below it. "
-        f"Learners ahead of offset-free MPC in the same seeds, by the whole interval: {'; '.join(passing)}."
-    )
-
-
-def _low(differences: pd.Series) -> float:
-    """The lower end of the interval of the median difference."""
-    return float(median_interval(differences.dropna().to_numpy())[0])
+def heat_map_names(results: Results) -> list[str]:
+    """The heat maps that there are, by grid and case."""
+    robust = read(results, "robustness", "robustness.csv").reindex(columns=["case", "group"])
+    found = robust.drop_duplicates().astype({"case": int}).itertuples(index=False, name=None)
+    return [f"limits_{group}_case_{case}" for case, group in sorted(found, key=lambda place: (place[0], [*GRIDS].index(place[1])))]

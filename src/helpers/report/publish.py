@@ -22,7 +22,7 @@ LIMITS = "tables/limits_gaps.csv"
 # Of README's gaps to the optimum:
 SHOWN = ("expert", "online", *LEARNERS, "mpc", "minimum_variance", "dynamic_programme_filtered")
 LEARNT, VARIANTS = re.compile(r"0[24]_(?:offline_irl|knowledge_transfer)_(\w+)"), ("improved", "printed")
-PARTS = ("report.html", "figures", "tables", "comparison.csv", "seeds.csv", "provenance.json")
+PARTS = ("report.html", "report.pdf", "report.md", "figures", "tables", "comparison.csv", "seeds.csv", "provenance.json")
 
 
 class PublishError(RuntimeError):

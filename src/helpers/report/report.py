@@ -4,55 +4,60 @@ import io
 import itertools
 import json
 import os
-import re
 import shutil
-from base64 import b64decode, b64encode
 from collections.abc import Mapping
 from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
-import pypandoc
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
-from PIL import Image
 
 from helpers.evidence.readings import MAIN
-from helpers.report import drawings, figures, limits_report, scorecard, statistics, tables
+from helpers.report import drawings, figures, limits_findings, limits_report, scorecard, statistics, tables, verdict_figures
 from helpers.report.collection import ONLINE, Results
+from helpers.report.limits_figures import GRIDS, LABELS, RIVALS
+from helpers.report.typesetting import render, shortened, to_html, to_pdf
 from helpers.runs.artifacts import ArtifactError, code_revision
 from helpers.runs.identity import digest, versions
 from helpers.runs.opening import parameters_hash
 from helpers.runs.pictures import smaller
 from helpers.runs.scratch import beside, sweep
 from helpers.runs.sources import PROJECT
-from helpers.settings.paper import OnlineParams
+from helpers.settings.paper import OnlineParams, Params
 
-RUNNERS = ("papermill", "snakemake", "pypandoc_binary")  # packages that shape no number
-SHOWN_AS_PIXELS = ("figure_3",)  # in README, where a reader without a browser of its own meets it
-PALETTE = 64  # colours of a picture inside a drawing, each with its own opacity
+RUNNERS = ("papermill", "snakemake", "pypandoc_binary", "typst")  # packages that shape no number
+SHOWN_AS_PIXELS = ("figure_3", "comparison")  # in README and report.md, where a reader without a browser of its own meets them
 LONGEST_TWIN = 100  # rows of a table that is written as Markdown too, for reading
 PROVENANCE = "provenance.json"
 OWN_ERROR = "as in the parameter files, with each trajectory's own |e| before the first step"  # what notebook 00 calls its main one
-TEMPLATE = PROJECT / "reports/template"
 BENCHMARKS = PROJECT / "reports/reference/benchmarks"  # of make bench, a run of its own
 OF_THE_PAPER = {"control_case_1": 3, "tracking_case_2": 4, "control_case_2": 5, "control_case_3": 6}  # numbers of its figures
+LEVELS = ("expert_paired", "offline", scorecard.MINIMUM_VARIANCE)  # what online learning is measured by
 
 
-def draw(results: Results) -> dict[str, Figure]:
-    """All figures of the report by name, each over all seeds."""
+def draw(results: Results, compared: pd.DataFrame) -> dict[str, Figure]:
+    """All figures of the report by name, each over all seeds.
+
+    Args:
+        compared: the comparison with the paper.
+    """
     first = next(iter(results.params.values()))
     policy, process = first.learning.policy, first.process
     descriptions = dict(zip(process.controlled, process.controlled_description, strict=True))
     descriptions |= dict(zip(process.manipulated, process.manipulated_description, strict=True))
     drawn = {
+        "comparison": verdict_figures.comparison_figure(compared),
         "figure_1": drawings.mdp_figure(),
         "figure_2": drawings.framework_figure(),
         "network": drawings.network_figure(
             policy.hidden_cells, len(process.controlled), len(process.manipulated), policy.leaky_slope
         ),
+    }
+    levels = {
+        case: {tables.CONTROLLERS[stage]: results.median(case, stage, "objective_x") for stage in LEVELS} for case in results.params
     }
     for case, params in results.params.items():
         target = params.case.set_point
@@ -61,25 +66,28 @@ def draw(results: Results) -> dict[str, Figure]:
         drawn[f"control_case_{case}"] = figures.control_figure(
             response, process.controlled, process.manipulated, target, descriptions
         )
+        if case == next(iter(results.params)):
+            look: dict[str, Any] = {"zoom_from": None, "size": (verdict_figures.NARROW, 3.9), "agent_label": "improved policy"}
+            drawn["page_one"] = figures.control_figure(response, process.controlled, process.manipulated, target, **look)
         response = results.table(case, offline, "response.csv")
         drawn[f"tracking_case_{case}"] = figures.tracking_figure(response, process.controlled, target, descriptions)
+        history = results.table(case, offline, "history.csv")
         chosen = round(results.median(case, "offline", "chosen_epoch"))
         words = "policy taken from here" + (" (median)" if results.n_seeds > 1 else "")
         drawn[f"learning_curves_case_{case}"] = figures.learning_curves(
-            results.table(case, offline, "history.csv"),
+            history.filter(regex="^(?!alpha:)"),
             marks={chosen: words},
             gap_levels={"the paper's own gap": results.published[case].feature_gap},
         )
+        drawn[f"weights_{case}"] = verdict_figures.weights_figure(history, compared[compared["case"] == case])
         history = results.table(case, ONLINE, "history.csv")
         marks = _rounds(params.case.online, history["epochs"].nunique())
-        drawn[f"online_curves_case_{case}"] = figures.learning_curves(history, marks=marks)
+        drawn[f"online_curves_case_{case}"] = figures.learning_curves(history, marks=marks, return_levels=levels[case])
     if len(results.budget):
-        stages = {tables.CONTROLLERS[name]: name for name in ("expert_paired", "offline", scorecard.MINIMUM_VARIANCE)}
-        levels = {}
-        for case in results.params:
-            levels[case] = {label: results.median(case, stage, "objective_x") for label, stage in stages.items()}
         titles = {case: f"Case Study {tables.ROMAN[case - 1]}" for case in results.params}
         drawn["online_budget"] = figures.budget_figure(results.budget, levels, titles)
+    if len(results.claims):
+        drawn["claims"] = verdict_figures.claims_figure(scorecard.claims_by_case(results.claims))
     drawn |= limits_report.draw(results)
     return {f"figure_{OF_THE_PAPER[name]}" if name in OF_THE_PAPER else name: figure for name, figure in drawn.items()}
 
@@ -107,6 +115,7 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
         "verdicts": scorecard.counts(compared),
         "summary": medians,
         "variants": tables.variants_table(medians),
+        "time": _seconds(results),
     }
     for case, published in results.published.items():
         tabulated[f"table_{published.table}"] = tables.results_table(compared[compared["case"] == case], names)
@@ -114,12 +123,9 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     tabulated["control_quality"] = pd.concat(quality, names=["case"]).reset_index("case").reset_index(drop=True)
     leaves = [leaf for params in results.params.values() for leaf in params.leaves]
     tabulated["parameters"] = tables.parameters_table(leaves)
-    seconds = [
-        {"case": case, "stage": folder, "seconds": stage.record["seconds"]} for (case, _, folder), stage in results.stages.items()
-    ]
-    tabulated["time"] = pd.DataFrame(seconds).groupby(["case", "stage"], as_index=False)["seconds"].median()
     if len(results.claims):
         tabulated |= {"claims": results.claims, "claims_seeds": results.claim_values.reset_index()}
+        tabulated["claims_by_case"] = scorecard.claims_by_case(results.claims)
     if len(results.trials):
         trials = tables.trials_table(results.trials)
         words = scorecard.against_headline(results.trials)
@@ -132,11 +138,15 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
         errors = scorecard.sampling_errors(tabulated["inferred_prediction"], results.published)
         wider = scorecard.comparison(results.published, results.seeds, medians, names, trajectories, errors)
         tabulated["comparison_initial_error"] = scorecard.changed(compared, wider)
-    return tabulated | limits_report.tabulate(results)
+    return tabulated | limits_report.without_the_plant(results) | limits_report.tabulate(results)
 
 
 def provenance(results: Results) -> dict[str, Any]:
-    """Where the report comes from: code, versions, seeds, parameters and time; `identity` is that of all its stages."""
+    """Where the report comes from and what it cost: code, versions, seeds, parameters, time; `identity` is that of all its stages.
+
+    Every cost that the project names is taken from here: `stage_seconds` of all stages together, and `seconds_by_stage`, medians
+    over the seeds of the paper's own stages.
+    """
     records = [stage.record for stage in (*results.stages.values(), *results.beyond)]
     return {
         "scale": results.scale,
@@ -149,12 +159,19 @@ def provenance(results: Results) -> dict[str, Any]:
         "versions": versions() | {name: metadata.version(name) for name in RUNNERS},
         "parameters": {str(case): parameters_hash(params) for case, params in results.params.items()},
         "stage_seconds": sum(record["seconds"] for record in records),
+        "seconds_by_stage": _seconds(results).to_dict("records"),
         "processor_threads": os.cpu_count(),
     }
 
 
+def _seconds(results: Results) -> pd.DataFrame:
+    """Columns case, stage, seconds: medians over the seeds."""
+    rows = [(case, folder, stage.record["seconds"]) for (case, _, folder), stage in results.stages.items()]
+    return pd.DataFrame(rows, columns=["case", "stage", "seconds"]).groupby(["case", "stage"], as_index=False).median()
+
+
 def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] | None = None) -> Path:
-    """Write report.html, figures/, tables/, comparison.csv, seeds.csv and provenance.json; returns the report's path.
+    """Write report.html, .pdf and .md, figures/, tables/, comparison.csv, seeds.csv and provenance.json; returns the first's path.
 
     What an earlier report left in those places is replaced; other files of the folder stay.
 
@@ -167,8 +184,8 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
         shutil.rmtree(partial, ignore_errors=True)
         for name in ("figures", "tables"):
             (partial / name).mkdir(parents=True)
-        drawn, origin = draw(results), provenance(results)
         tabulated = tabulate(results) if tabulated is None else tabulated
+        drawn, origin = draw(results, tabulated["comparison"]), provenance(results)
         for name, figure in drawn.items():
             figures.lay_out(figure)
             drawing = io.StringIO()
@@ -189,9 +206,10 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
             shutil.copy2(results.inferred.path("profiles.svg"), partial / "figures/inferred_profiles.svg")
         if (BENCHMARKS / "scaling.svg").is_file():
             shutil.copy2(BENCHMARKS / "scaling.svg", partial / "figures/benchmarks.svg")
-        text = render(results, tabulated, origin)
-        (partial / "report.md").write_text(text, encoding="utf-8")
-        typeset(text, partial)
+        values = said(results, tabulated, origin)
+        to_html(render("report.md.jinja", folder, appendix=None, **values), partial)
+        to_pdf(render("report.md.jinja", folder, appendix=[], **values), partial)
+        (partial / "report.md").write_text(render("summary.md.jinja", folder, appendix=None, **values), encoding="utf-8")
         for path in sorted(partial.iterdir(), key=lambda path: path.name == PROVENANCE):  # last: it vouches for the others
             target = folder / path.name
             if target.is_dir():
@@ -204,71 +222,71 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
     return folder / "report.html"
 
 
-def shortened(drawing: str) -> str:
-    """An SVG drawing in half the bytes, without what no screen shows.
-
-    Coordinates have two decimals, the font is named once, nothing is indented or turned by nought, and pictures of lines have a
-    palette.
-    """
-    drawing = re.sub(r' (?:[dxy]="|transform="[rt])[^"]*"', lambda found: re.sub(r"(\.\d\d)\d+", r"\1", found[0]), drawing)
-    drawing = re.sub(r' transform="rotate\(-?0 [^"]*"|(?<=\n) +', "", drawing)
-    if fonts := re.search(r" font-family: ([^;\"]*);", drawing):
-        drawing = drawing.replace(fonts[0], "").replace("<svg ", f'<svg font-family="{fonts[1]}" ', 1)
-    return re.sub(r'(?<=;base64,)[^"]+', lambda found: b64encode(_with_palette(b64decode(found[0]))).decode(), drawing)
-
-
-def _with_palette(png: bytes) -> bytes:
-    """The PNG of see-through lines with a palette; one without transparency is a map whose every colour is a value, and stays."""
-    picture, found = Image.open(io.BytesIO(png)).convert("RGBA"), io.BytesIO()
-    if picture.getchannel("A").getextrema() == (255, 255):
-        return png
-    picture.quantize(PALETTE).save(found, format="PNG", optimize=True)
-    return min(png, found.getvalue(), key=len)
-
-
-def render(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapping[str, Any]) -> str:
-    """The report as Markdown, from its template; every number in its prose comes from the results."""
-    environment = Environment(loader=FileSystemLoader(TEMPLATE), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["percent"] = lambda share: f"{100 * share:.1f} %"
-    environment.filters["numeral"] = lambda case: tables.ROMAN[case - 1]
-    environment.filters["table"] = tables.to_markdown
-    environment.filters["claims_table"] = tables.claims_table
-    environment.filters["stacked"] = stacked
+def said(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapping[str, Any]) -> dict[str, Any]:
+    """What the templates say, by name; every number in their prose comes from the results."""
     numbers = results.medians.set_index(scorecard.KEYS)[["median", "ci_low", "ci_high"]]
+    compared, limits = tabulated["comparison"], limits_findings.find(results)
 
     def number(case: int, stage: str, metric: str, factor: float = 1, **style: Any) -> str:
         """A median with its interval."""
         return tables.spread(factor * numbers.reindex([(case, stage, metric)]).iloc[0], **style)
 
+    def plain(case: int, stage: str, metric: str, factor: float, decimals: int) -> str:
+        """A median alone."""
+        found = factor * results.median(case, stage, metric)
+        return tables.NOT_KNOWN if np.isnan(found) else f"{found + 0.0:,.{decimals}f}"
+
     parts = {part: BENCHMARKS / f"{part}.md" for part in ("summary", "machine")}
     benchmarks = {part: path.read_text(encoding="utf-8") for part, path in parts.items() if all(map(Path.is_file, parts.values()))}
-    return environment.get_template("report.md.jinja").render(
-        results=results,
-        tables=tabulated,
-        compared=tabulated["comparison"],
-        origin=origin,
-        number=number,
-        gaps=tabulated["gaps"].set_index("case").to_dict("index"),
-        cases=results.params,
-        published=results.published,
-        benchmarks=benchmarks,
-        claims=scorecard.verdicts_of_claims(results.claims),
-        limits=limits_report.find(results),
-        listing=partial(scorecard.listing, tabulated["comparison"]),
-        better=_better(results),
-        nearer=scorecard.nearer_to_expert(tabulated["comparison"]),
-        outside=scorecard.outside(tabulated["comparison"]),
-        settings=partial(_settings, tabulated["parameters"]),
-        level=statistics.LEVEL,
-        fewest=statistics.FEWEST,
-        trajectories=scorecard.PUBLISHED_TRAJECTORIES,
-        widest=scorecard.WIDEST,
-    )
+    weights = compared[compared["row"] == "alpha"]
+    alike = np.sign(weights["published"]) == np.sign(weights["reproduced"])
+    return {
+        "results": results,
+        "tables": tabulated,
+        "time": tables.time_table(tabulated["time"]),
+        "origin": origin,
+        "number": number,
+        "plain": plain,
+        "gaps": tabulated["gaps"].set_index("case").to_dict("index"),
+        "cases": results.params,
+        "published": results.published,
+        "of_the_paper": {case: OF_THE_PAPER[f"control_case_{case}"] for case in results.params},
+        "benchmarks": benchmarks,
+        "claims": tabulated.get("claims_by_case"),
+        "frozen": _frozen(results),
+        "limits": limits,
+        "rivals": {name: LABELS[name] for name in RIVALS},
+        "grids": {group: title for group, (title, _, _) in GRIDS.items()},
+        "heat_maps": [name.removeprefix("limits_") for name in limits_report.heat_map_names(results)],
+        "one_policy": tabulated.get("one_policy", ()),
+        "own_plant": tabulated.get("own_plant", ()),
+        "verdicts": compared["verdict"].value_counts().reindex(scorecard.VERDICTS, fill_value=0).to_dict(),
+        "weights": {"total": len(weights), "open": int((weights["verdict"] == "cannot tell").sum()), "alike": int(alike.sum())},
+        "offset": {stage: abs(results.median(3, stage, "offset:C_A")) for stage in tables.CONTROLLERS},
+        "holding": {case: _holding(params) for case, params in results.params.items()},
+        "better": _better(results),
+        "nearer": scorecard.nearer_to_expert(compared),
+        "outside": scorecard.outside(compared),
+        "settings": partial(_settings, tabulated["parameters"]),
+        "level": statistics.LEVEL,
+        "fewest": statistics.FEWEST,
+        "trajectories": scorecard.PUBLISHED_TRAJECTORIES,
+        "widest": scorecard.WIDEST,
+    }
 
 
-def stacked(table: str) -> str:
-    """A Markdown table in which an interval is not broken, so that in narrow columns it stands below its median."""
-    return re.sub(r"\[(\S+), (\S+)\]", "[\\1,\N{NO-BREAK SPACE}\\2]", table)
+def _frozen(results: Results) -> dict[str, dict[int, float]] | None:
+    """The gap of a policy that learned from scratch under the weights held fixed, by case, where it was run."""
+    found = results.claims[results.claims["id"] == "weights_explain_the_expert"]
+    found = found[found["quantity"].str.contains("our weights")].set_index("case")[["median"]]
+    return found.to_dict() if len(found) and found.notna().all(axis=None) else None
+
+
+def _holding(params: Params) -> float:
+    """The greatest share of its bound at which an input must stand to hold the set point: A x + B u = 0 (Eq. 4.1.3b)."""
+    process = params.process
+    inputs = -np.linalg.solve(np.array(process.drift_input), np.array(process.drift_state) @ np.array(params.case.set_point))
+    return float(np.max(inputs / np.where(inputs > 0, process.input_high, process.input_low)))
 
 
 def _settings(parameters: pd.DataFrame, status: str, part: int) -> str:
@@ -282,7 +300,7 @@ def _settings(parameters: pd.DataFrame, status: str, part: int) -> str:
 def _better(results: Results) -> dict[str, list[int]]:
     """The cases in which ours is better beyond its interval: the gap below the paper's, online J above the PID's.
 
-    worse_as_printed: those in which the gap of the algorithms as printed lies above the paper's.
+    printed and worse_as_printed: those in which the gap of the algorithms as printed lies below the paper's, and above it.
     """
     numbers = results.medians.set_index(scorecard.KEYS)
     low, high = (numbers[end].fillna(numbers["median"]) for end in ("ci_low", "ci_high"))
@@ -290,24 +308,5 @@ def _better(results: Results) -> dict[str, list[int]]:
     gap = [case for case in papers if high[case, "offline", "feature_gap"] < papers[case]]
     worse = [case for case in papers if low[case, "offline_printed", "feature_gap"] > papers[case]]
     online = [case for case in results.params if low[case, "online", "objective_x"] > high[case, "expert_paired", "objective_x"]]
-    return {"gap": gap, "worse_as_printed": worse, "online": online}
-
-
-def typeset(text: str, folder: Path) -> None:
-    """Markdown to one HTML file that needs no network: figures inside, maths as MathML."""
-    pypandoc.convert_text(
-        text,
-        "html5",
-        format="markdown",
-        outputfile=str(folder / "report.html"),
-        extra_args=[
-            "--standalone",
-            "--mathml",
-            "--embed-resources",
-            "--toc",
-            "--toc-depth=1",
-            "--columns=10000",  # otherwise a long line in the source of a table fixes the widths of its columns
-            f"--resource-path={folder}",
-            f"--css={TEMPLATE / 'report.css'}",
-        ],
-    )
+    printed = [case for case in papers if high[case, "offline_printed", "feature_gap"] < papers[case]]
+    return {"gap": gap, "printed": printed, "worse_as_printed": worse, "online": online}

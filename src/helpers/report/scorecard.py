@@ -6,13 +6,13 @@ import numpy as np
 import pandas as pd
 
 from helpers.report.statistics import median_interval, prediction_interval
-from helpers.report.tables import NOT_KNOWN, RESULT_DECIMALS, ROMAN, feature_symbol
+from helpers.report.tables import NOT_KNOWN, RESULT_DECIMALS, ROMAN
 from helpers.settings.paper import HEADLINE, PublishedCase
 
 REPRODUCED_BY = {"expert": ("expert", "v"), "policy": ("offline", "v"), "alpha": ("offline", "alpha")}  # stage, metric
 MINIMUM_VARIANCE = "minimum_variance"  # the stage of the controller to measure online learning by
 FITTED = "expert"  # this row's settings were inferred from the very numbers that it is compared with
-ROWS = {"expert": "features of the expert", "policy": "features of the policy", "alpha": "weights"}
+ROWS = {"expert": "features of the PID", "policy": "features of the policy", "alpha": "weights"}
 VERDICTS = ("match", "differs", "cannot tell", "fitted")
 WIDEST = 0.25  # half the width of a prediction interval that can still tell, as a share of the published value
 PUBLISHED_TRAJECTORIES = 500  # behind a published feature, Section 5.1.1
@@ -192,19 +192,6 @@ def counts(compared: pd.DataFrame) -> pd.DataFrame:
     return table.rename(index=ROWS).rename_axis(index="published numbers", columns=None).reset_index()
 
 
-def listing(compared: pd.DataFrame, wanted: str) -> str:
-    """Which published numbers have a verdict, case by case; empty for none."""
-    of_row = compared.groupby(["case", "row"])["feature"].count()
-    lines = []
-    for case, of_case in compared[compared["verdict"] == wanted].groupby("case"):
-        kinds = []
-        for row, features in of_case.groupby("row", sort=False)["feature"]:
-            symbols = ", ".join(features.map(feature_symbol)).replace("-", "\u2011")  # a hyphen at which no line breaks
-            kinds.append(f"all {ROWS[row]}" if len(features) == of_row[case, row] else f"{ROWS[row]} {symbols}")
-        lines.append(f"Case Study {ROMAN[case - 1]}: {'; '.join(kinds)}")
-    return ". ".join(lines)
-
-
 def nearer_to_expert(compared: pd.DataFrame) -> int:
     """How many features of the policy differ from the printed ones and lie nearer to the printed expert than those do."""
     numbers = compared.set_index(["row", "case", "feature"]).sort_index()
@@ -257,35 +244,31 @@ def against_headline(trials: pd.DataFrame) -> dict[str, str]:
     return found
 
 
-def verdicts_of_claims(claims: pd.DataFrame) -> dict[str, list[str]]:
-    """The claims, each with its section, by what all its cases and quantities say together.
+def claims_by_case(claims: pd.DataFrame) -> pd.DataFrame:
+    """One row a claim: section, statement, a verdict for each case it is made of, the verdict on the whole, and how it was counted.
 
-    A claim `holds` where it holds throughout, `holds in part` where it holds in some and not in others, `does not hold` where
-    it fails somewhere and holds nowhere; otherwise one `cannot tell`, or it is `not comparable`.
+    One rule for all sides: `holds` or `does not hold` where every quantity says so, `in part` where both occur, otherwise
+    `cannot tell` or `not comparable`.
 
     Args:
         claims: columns id, section, statement, case, quantity, verdict.
     """
-    found: dict[str, list[str]] = {"holds": [], "holds in part": [], "does not hold": [], "cannot tell": [], "not comparable": []}
-    for _, rows in claims.groupby("id", sort=False):
-        statement = rows["statement"].iloc[0]
-        text = f"{statement[:1].upper()}{statement[1:]} ({rows['section'].iloc[0]})"
-        verdicts = set(rows["verdict"])
-        if len(verdicts) == 1:
-            found[verdicts.pop()].append(text)
-        elif {"holds", "does not hold"} <= verdicts:
-            found["holds in part"].append(f"{text}: not for {_failing(rows)}")
-        else:
-            found["does not hold" if "does not hold" in verdicts else "cannot tell"].append(text)
-    return found
+    rows = []
+    for _, found in claims.groupby("id", sort=False):
+        row = {name: found[name].iloc[0] for name in ("section", "statement")}
+        row["statement"] = row["statement"][:1].upper() + row["statement"][1:]
+        of_case = found.groupby("case")["verdict"].agg(_together)
+        row |= {ROMAN[case - 1]: of_case.get(case, "") for case in sorted(claims["case"].unique())}
+        counted = found["verdict"].value_counts(sort=False)
+        row["overall"] = _together(found["verdict"])
+        row["quantities"] = ", ".join(f"{count} {verdict}" for verdict, count in counted.items()) if len(found) > 1 else ""
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
-def _failing(rows: pd.DataFrame) -> str:
-    """Where a claim fails: its cases, and which quantities, or how many, in a case in which others do not fail."""
-    places = []
-    for case, of_case in rows.groupby("case"):
-        failing = of_case.loc[of_case["verdict"] == "does not hold", "quantity"]
-        if len(failing):
-            named = "; ".join(failing) if len(failing) < 3 else f"{len(failing)} of {len(of_case)} quantities"
-            places.append(f"Case Study {ROMAN[case - 1]}{f' ({named})' if len(failing) < len(of_case) else ''}")
-    return ", ".join(places)
+def _together(verdicts: pd.Series) -> str:
+    """The verdict of several quantities."""
+    said = set(verdicts)
+    if len(said) == 1:
+        return said.pop()
+    return "in part" if {"holds", "does not hold"} <= said else "cannot tell"

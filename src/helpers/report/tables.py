@@ -1,4 +1,4 @@
-"""What the report shows as tables: Tables 1-4, control quality, variants, claims, trials and parameters, also as Markdown."""
+"""What the report shows as tables: Tables 1-4, control quality, variants, trials and parameters, also as Markdown."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -29,6 +29,7 @@ TYPESET = {
 NOT_KNOWN = "–"
 FEATURE = re.compile(r"(\w+)-(I{1,3})")
 NUMBER = re.compile(rf"-?[\d.]+(e-?\d+)?( %)?( \[.*\]| \(.*\))?|{NOT_KNOWN}|inf")
+VARIABLE = re.compile(r"(?<![A-Za-z_])(C_A0|C_A|T_E)(?![A-Za-z0-9_])")
 LOOP = re.compile(r"(.*)\((\w+)\) control loop")
 
 
@@ -83,9 +84,7 @@ def spread(numbers: Mapping[str, Any] | pd.Series, digits: int = 3, decimals: in
 
 
 def results_table(compared: pd.DataFrame, feature_names: Sequence[str]) -> pd.DataFrame:
-    """Table 2, 3 or 4 as text: each printed row and, below it, our median, its interval, that of one run, and the verdict.
-
-    Intervals have a row where there are any.
+    """Table 2, 3 or 4 as text: each printed row and, below it, our median, the interval of one run, if any, and the verdict.
 
     Args:
         compared: the rows of one case in the comparison with the paper.
@@ -97,7 +96,6 @@ def results_table(compared: pd.DataFrame, feature_names: Sequence[str]) -> pd.Da
         lines = {
             "published": shown["published"],
             "reproduced": shown["reproduced"],
-            "interval of median": (shown["ci_low"] + " to " + shown["ci_high"]).where(numbers["ci_low"].notna(), NOT_KNOWN),
             "interval of one run": (shown["pred_low"] + " to " + shown["pred_high"]).where(numbers["pred_low"].notna(), NOT_KNOWN),
             "verdict": numbers["verdict"],
         }
@@ -143,7 +141,7 @@ def variants_table(medians: pd.DataFrame) -> pd.DataFrame:
     for (case, stage), group in medians[medians["stage"].isin(LEARNING)].groupby(["case", "stage"]):
         found = group.set_index("metric")
         gap = 100 * found.loc["feature_gap", ["median", "ci_low", "ci_high", "greatest"]].astype(float)
-        row = {"case": case, "learning": LEARNING[stage], "n_seeds": found.loc["feature_gap", "n_seeds"]}
+        row = {"case": ROMAN[int(case) - 1], "learning": LEARNING[stage], "seeds": found.loc["feature_gap", "n_seeds"]}
         row |= {"feature gap, %": spread(gap, decimals=1), "worst seed, %": _number(gap["greatest"], 4, 1)}
         rows.append(row | {name.replace("_", " "): int(found.loc[name, "median"]) for name in COSTS})
     return pd.DataFrame(rows).sort_values(["case", "learning"], ignore_index=True)
@@ -169,19 +167,17 @@ def trials_table(trials: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def claims_table(claims: pd.DataFrame) -> pd.DataFrame:
-    """The paper's checkable sentences with what the seeds say, as text; section and statement once for each claim.
+def time_table(seconds: pd.DataFrame) -> pd.DataFrame:
+    """Seconds of each stage (rows) in each case (columns).
 
     Args:
-        claims: columns id, section, statement, case, quantity, n, median, ci_low, ci_high, test, verdict, reason.
+        seconds: columns case, stage, seconds.
     """
-    again = claims["id"].duplicated()
-    rows = []
-    for repeated, claim in zip(again, claims.to_dict("records"), strict=True):
-        row = {name: "" if repeated else claim[name] for name in ("section", "statement")}
-        row |= {"case": ROMAN[claim["case"] - 1], "quantity": claim["quantity"], "median": spread(claim), "seeds": claim["n"]}
-        rows.append(row | {name: claim[name] for name in ("test", "verdict", "reason")})
-    return pd.DataFrame(rows)
+    wide = seconds.pivot_table(index="stage", columns="case", values="seconds").rename(
+        columns=lambda case: f"Case {ROMAN[case - 1]}"
+    )
+    shown = wide.map(lambda value: NOT_KNOWN if np.isnan(value) else f"{value:.0f}").reset_index()
+    return shown.assign(stage=shown["stage"].str.replace("_", " "))
 
 
 def parameters_table(leaves: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
@@ -228,7 +224,8 @@ def _header(name: str) -> str:
     typeset = _text(name)
     if typeset != name or FEATURE.fullmatch(name) or "$" in name:
         return typeset
-    words = name.replace("_", " ")
+    parts = VARIABLE.sub(lambda found: symbol(found[0]), name).split(" ")
+    words = " ".join(part if "$" in part else part.replace("_", " ") for part in parts)
     return words[:1].upper() + words[1:]
 
 

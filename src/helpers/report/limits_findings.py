@@ -1,0 +1,197 @@
+"""What the numbers of notebook 06 say over cases and seeds, for the words of the report; every number comes from its tables."""
+
+from typing import Any
+
+import pandas as pd
+
+from helpers.report.collection import Results
+from helpers.report.limits_figures import LABELS, LEARNERS, RIVALS
+from helpers.report.limits_report import (
+    ahead,
+    listed_budgets,
+    on_mismatch,
+    plant_names,
+    read,
+    sharp_gaps,
+    summary,
+    unholdable,
+    worst,
+)
+from helpers.report.statistics import FEWEST, median_interval
+from helpers.report.tables import symbol
+
+TUNED = 1.05  # of the objective it began with, for a search to have found other gains
+END_IN_REINFORCE = ("online", "irl_reinforce", "clone_reinforce", "csil_reinforce", "scratch_reinforce")
+
+
+def find(results: Results) -> dict[str, Any]:
+    """What the section says, by the name of the function below that found it; nothing where notebook 06 was not run."""
+    if read(results, "attainable", "gaps.csv").empty:
+        return {}
+    learning = (seeds, attainable, agreement, standings, tuned, practice, not_found)
+    parts = (*learning, ranges, left_out, there, out_of_reach, price)
+    return {part.__name__: part(results) for part in parts}
+
+
+def seeds(results: Results) -> dict[int, int]:
+    """How many seeds there are of each case."""
+    found: dict[int, int] = read(results, "attainable", "gaps.csv").groupby("case")["seed"].nunique().to_dict()
+    return found
+
+
+def attainable(results: Results) -> dict[int, dict[str, float]]:
+    """By case, medians in per cent of the programme's objective.
+
+    look_ahead: what it gains over one-step control; noise: what it loses behind a filter; filter: what filtering gives one-step
+    control on y.
+    """
+    gaps = sharp_gaps(results).pivot_table(index="case", columns="controller", values="gap", aggfunc="median")
+    return {
+        int(case): {
+            "look_ahead": row["minimum_variance_x"],
+            "noise": row["dynamic_programme_filtered"],
+            "filter": row["minimum_variance"] - row["minimum_variance_filtered"],
+        }
+        for case, row in gaps.iterrows()
+    }
+
+
+def agreement(results: Results) -> float:
+    """The largest difference between the programme's value and that of its policy by Monte Carlo, in per cent."""
+    grids = read(results, "attainable", "grids.csv").drop_duplicates(["case", "seed", "beta"], keep="last")
+    return 100 * float(grids["difference"].abs().max())
+
+
+def standings(results: Results) -> dict[int, dict[str, dict[str, list[int]]]]:
+    """By budget and rival: the cases in which the paper's learner is ahead of it, behind it, or where the seeds cannot tell.
+
+    Cases with too few seeds for an interval are left out.
+    """
+    found: dict[int, dict[str, dict[str, list[int]]]] = {}
+    for row in summary(ahead(listed_budgets(results))).dropna(subset="ci_low").itertuples():
+        word = "ahead" if row.ci_low > 0 else "behind" if row.ci_high < 0 else "level"
+        found.setdefault(row.metric, {}).setdefault(row.stage, {}).setdefault(word, []).append(row.case)
+    return dict(sorted(found.items()))
+
+
+def tuned(results: Results) -> dict[int, dict[str, float]]:
+    """By case, how the searches for gains of the PID ended: in how many seeds above `TUNED`, and the range of the objective."""
+    curves = read(results, "budget", "curves.csv").query("learner == 'pid_tuned'").sort_values("episodes")
+    found = {}
+    for case, rows in curves.groupby("case"):
+        ends = rows.groupby("seed")["objective"].agg(["first", "last"])
+        better = int((ends["last"] > TUNED * ends["first"]).sum())
+        found[int(case)] = {"better": better, "seeds": len(ends), "least": ends["last"].min(), "greatest": ends["last"].max()}
+    return found
+
+
+def practice(results: Results) -> dict[str, Any]:
+    """What helps to choose.
+
+    model_ahead: the cases in which minimum variance on y lies above every learner at the last budget; never_below: the controllers
+    that no condition puts below the PID; least: the range of what those that end in REINFORCE keep of the PID's objective at other
+    set points, in per cent; without_model: by budget the best that needs none, with its cases. All in the median.
+    """
+    listed = listed_budgets(results).astype({"metric": int})
+    medians = listed.groupby(["case", "metric", "learner"])["value"].median()
+    reached = sharp_gaps(results).groupby(["case", "controller"])["objective"].median()
+    model_ahead: list[int] = []
+    without_model: dict[int, dict[str, list[int]]] = {}
+    for (case, budget), row in medians.unstack("learner").iterrows():  # noqa: PD010
+        if budget == max(listed["metric"]) and reached[case, "minimum_variance"] > row.reindex(LEARNERS).max():
+            model_ahead.append(int(case))
+        if budget and (others := row.reindex(RIVALS).dropna()).size:
+            without_model.setdefault(int(budget), {}).setdefault(LABELS[others.idxmax()], []).append(int(case))
+    shares = worst(results)
+    kept = shares.pivot_table(index="controller", columns=["case", "group"], values="value", aggfunc="median").drop(index="expert")
+    points = shares[(shares["group"] == "set_point") & shares["controller"].isin(END_IN_REINFORCE)]
+    least = points.groupby(["case", "controller"])["value"].median()
+    return {
+        "model_ahead": model_ahead,
+        "never_below": [LABELS[name] for name in LABELS if name in kept.index and (kept.loc[name] >= 100).all()],
+        "least": (least.min(), least.max()),
+        "without_model": without_model,
+    }
+
+
+def not_found(results: Results) -> dict[int, list[str]]:
+    """By case, the learners with a loop whose mean response comes to no 90 % of the change in most seeds, and that loop."""
+    quality = read(results, "quality", "quality.csv")
+    rises = quality[quality["figure"].str.startswith("rise_time:") & quality["controller"].isin(LEARNERS)]
+    missed = rises.assign(missed=rises["value"].isna()).groupby(["case", "controller", "figure"], sort=False)["missed"].mean()
+    found: dict[int, list[str]] = {}
+    for case, controller, figure in missed[missed > 0.5].index:
+        found.setdefault(int(case), []).append(f"{LABELS[controller]} ({symbol(figure.partition(':')[2])})")
+    return found
+
+
+def ranges(results: Results) -> str:
+    """What the grids of conditions span, in words."""
+    robust = read(results, "robustness", "robustness.csv")
+    words = {
+        "model": "A and B times {} and {}",
+        "noise": "disturbance times {} and observation noise times {}",
+        "set_point": "the set points of the two loops times {} and {}",
+        "time": "dead time of {} samples and a load step of {} of the set point change per sample",
+    }
+    spans = robust.astype({"row": float, "column": float}).groupby("group")[["row", "column"]].agg(["min", "max"])
+    found = []
+    for group, text in words.items():
+        if group in spans.index:
+            ends = spans.loc[group]
+            found.append(text.format(*(f"{ends[axis, 'min']:g} to {ends[axis, 'max']:g}" for axis in ("row", "column"))))
+    return "; ".join(found)
+
+
+def left_out(results: Results) -> dict[str, dict[int, tuple[int, int]]]:
+    """By group and case, how many of how many conditions were left out because no input within the bounds holds the set point."""
+    robust = read(results, "robustness", "robustness.csv")
+    place = ["case", "group", "row", "column"]
+    total = robust[place].drop_duplicates().groupby(["group", "case"]).size()
+    out = unholdable(results).groupby(["group", "case"]).size()
+    found: dict[str, dict[int, tuple[int, int]]] = {}
+    for (group, case), count in out.items():
+        found.setdefault(group, {})[int(case)] = (int(count), int(total[group, case]))
+    return found
+
+
+def out_of_reach(results: Results) -> dict[str, list[int]]:
+    """By mismatched plant that was improved on, the cases of which no input within the bounds holds the set point there."""
+    out = unholdable(results).query("group == 'model'")
+    out = out.assign(plant=plant_names(out["row"].astype(float), out["column"].astype(float)))
+    found: dict[str, list[int]] = out[out["plant"].isin(on_mismatch(results)["plant"])].groupby("plant")["case"].agg(list).to_dict()
+    return found
+
+
+def there(results: Results) -> dict[str, dict[int, list[str]]]:
+    """By mismatched plant and case, the controllers that improving on that plant is not ahead of.
+
+    By the whole interval of the difference within seeds; nothing for too few seeds.
+    """
+    every = on_mismatch(results)
+    found: dict[str, dict[int, list[str]]] = {}
+    for (plant, case), rows in every.groupby(["plant", "case"], sort=False):
+        reached = rows.pivot_table(index="seed", columns="controller", values="objective")
+        if len(reached) >= FEWEST:
+            others = [name for name in LABELS if name in reached and name != "online_there"]
+            behind = [LABELS[name] for name in others if _low(reached["online_there"] - reached[name]) <= 0]
+            found.setdefault(plant, {})[int(case)] = behind
+    return found
+
+
+def price(results: Results) -> dict[int, dict[str, float]]:
+    """What online improvement costs in each case, in per cent and medians over seeds.
+
+    worse: the exploring episodes that were worse than the PID; set_point and model: the least share of the PID's objective that
+    the improved policy reaches at set points not trained on and on plants that are not the model, where the bounds allow it.
+    """
+    safety = read(results, "safety", "safety.csv")
+    worse = 100 * safety[safety["run"] == "hot"].groupby("case")["worse"].median()
+    online = worst(results).query("controller == 'online'")
+    kept = online.pivot_table(index="case", columns="group", values="value", aggfunc="median")
+    return kept.reindex(columns=["set_point", "model"]).assign(worse=worse).to_dict("index")
+
+
+def _low(differences: pd.Series) -> float:
+    """The lower end of the interval of the median difference."""
+    return float(median_interval(differences.dropna().to_numpy())[0])

@@ -1,0 +1,160 @@
+"""Pictures of verdicts: every published number beside ours, the weights, and the paper's claims. They compute no result."""
+
+from collections.abc import Sequence
+from string import ascii_uppercase
+from textwrap import fill
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+
+from helpers.report.figures import INK, MUTED, WIDTH, empty_figure, feature_styles
+from helpers.report.tables import ROMAN, feature_symbol, symbol
+
+# Colour and shape of a verdict, so that it can be read without colours.
+MARKS: dict[str, dict[str, Any]] = {
+    "match": {"marker": "o", "color": "#17803d"},
+    "differs": {"marker": "X", "color": "#c2410c"},
+    "cannot tell": {"marker": "s", "color": "#777777", "markerfacecolor": "white"},
+    "fitted": {"marker": "^", "color": "#1f4fd8", "markerfacecolor": "white"},
+}
+MARKS |= {"holds": MARKS["match"], "does not hold": MARKS["differs"], "in part": {"marker": "D", "color": "#b8860b"}}
+MARKS |= {"not comparable": {"marker": "_", "color": "#777777"}}
+ROWS = {"expert": "PID, features", "policy": "policy, features", "alpha": "weights"}
+LINEAR = 10.0  # per cent to either side of the published value that are drawn to scale; beyond, by powers of ten
+SMOOTH = 0.05  # of all epochs, over which a curve of weights is averaged
+NARROW = 7.6  # inches, of a picture on page one
+
+
+def _handles(verdicts: Sequence[str]) -> list[Line2D]:
+    return [Line2D([], [], linestyle="", label=verdict, markersize=6, **MARKS[verdict]) for verdict in verdicts]
+
+
+def comparison_figure(compared: pd.DataFrame) -> Figure:
+    """Every published number of Tables 2 to 4 and ours: a panel for each table, a row for each number, marked by its verdict.
+
+    The axis is how far ours lies from the published number, in per cent of it; the line is the 95 % interval for one run, and
+    the published number is nought.
+
+    Args:
+        compared: the comparison with the paper, columns of `scorecard.COLUMNS`.
+    """
+    printed = sorted(compared["table"].unique())
+    numbers = compared[["reproduced", "pred_low", "pred_high"]].sub(compared["published"], axis=0)
+    relative = 100 * numbers.div(compared["published"].abs(), axis=0)
+    features = list(dict.fromkeys(compared["feature"]))
+    heights = {(row, name): -i - 0.9 * j for j, row in enumerate(ROWS) for i, name in enumerate(features, j * len(features))}
+    figure = empty_figure(NARROW, 4.0)
+    panels = np.atleast_1d(figure.subplots(1, len(printed), sharey=True, sharex=True))
+    for axes, table in zip(panels, printed, strict=True):
+        rows = compared[compared["table"] == table]
+        for index, row in rows.iterrows():
+            ours, low, high = relative.loc[index]
+            y = heights[row["row"], row["feature"]]
+            mark = MARKS[row["verdict"]]
+            axes.plot([low, high], [y, y], color=mark["color"], linewidth=1.3)
+            axes.plot([ours], [y], label=f"{row['row']} {row['feature']}", markersize=5.5, **mark)
+        axes.axvline(0, color=INK, linewidth=1)
+        axes.set_xscale("symlog", linthresh=LINEAR, linscale=1.2)
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda share, _: f"{share:+,.0f}" if share else "0"))
+        axes.set_title(f"Table {table} (Case {ROMAN[rows['case'].iloc[0] - 1]})", fontsize=9)
+        axes.set_label(f"Table {table}")
+        axes.grid(axis="y", visible=False)
+        axes.tick_params(axis="x", labelsize=7, rotation=35)
+    panels[0].set_yticks(list(heights.values()), [feature_symbol(name) for _, name in heights], fontsize=7)
+    for row, words in ROWS.items():
+        middle = np.mean([y for (of_row, _), y in heights.items() if of_row == row])
+        place: Any = {"ha": "center", "va": "center", "rotation": 90, "fontsize": 8, "color": MUTED}
+        panels[0].text(-0.36, middle, words, transform=panels[0].get_yaxis_transform(), **place)
+    figure.supxlabel("ours less the published number, % of it (to scale within ± 10 %)", fontsize=8.5)
+    found = set(compared["verdict"])
+    listed = [verdict for verdict in ("match", "differs", "cannot tell", "fitted") if verdict in found]
+    figure.legend(handles=_handles(listed), loc="outside upper center", ncols=4, frameon=False, fontsize=8.5)
+    return figure
+
+
+def claims_figure(judged: pd.DataFrame) -> Figure:
+    """The paper's claims, a row for each, with a mark for each case study.
+
+    Args:
+        judged: `scorecard.claims_by_case`: statement, then a column for each case with a verdict or an empty text.
+    """
+    cases = [column for column in judged if column in ROMAN]
+    lines = [fill(statement, 96) for statement in judged["statement"]]
+    figure = empty_figure(WIDTH, 0.9 + 0.155 * sum(line.count("\n") + 1.4 for line in lines))
+    axes = figure.subplots()
+    height, heights = 0.0, []
+    for line in lines:
+        heights.append(height - (line.count("\n") + 1.4) / 2)
+        height -= line.count("\n") + 1.4
+    for x, case in enumerate(cases):
+        for y, verdict in zip(heights, judged[case], strict=True):
+            if verdict:
+                axes.plot([x], [y], label=case, markersize=6.5, linestyle="", **MARKS[verdict])
+    axes.set_yticks(heights, lines, fontsize=8)
+    axes.set_xticks(range(len(cases)), cases)
+    axes.tick_params(length=0, labeltop=True, labelbottom=False)
+    axes.set(xlim=(-0.6, len(cases) - 0.4), ylim=(height, 0))
+    axes.set_label("claims")
+    axes.spines[["left", "bottom"]].set_visible(False)
+    found = set(judged[cases].to_numpy().ravel())
+    order = [verdict for verdict in ("holds", "in part", "does not hold", "cannot tell", "not comparable") if verdict in found]
+    figure.legend(handles=_handles(order), loc="outside upper center", ncols=5, frameon=False)
+    return figure
+
+
+def weights_figure(history: pd.DataFrame, compared: pd.DataFrame) -> Figure:
+    """The weights while they are learned, a panel for each loop, and those learned beside the printed ones.
+
+    A curve is the median over seeds, averaged over a twentieth of the epochs; its band holds the middle half of the seeds.
+
+    Args:
+        history: columns epochs, seed and alpha:<feature>.
+        compared: the rows of one case in the comparison with the paper.
+    """
+    printed = compared[compared["row"] == "alpha"].set_index("feature")
+    loops = list(dict.fromkeys(name.rpartition("-")[0] for name in printed.index))
+    figure = empty_figure(WIDTH, 3.6)
+    *panels, last = figure.subplots(1, len(loops) + 1)
+    styles = feature_styles(list(printed.index))
+    width = max(1, round(SMOOTH * history["epochs"].nunique()))
+    for letter, axes, loop in zip(ascii_uppercase, panels, loops, strict=False):
+        for name in printed.index[printed.index.str.rpartition("-").get_level_values(0) == loop]:
+            runs = history.pivot_table(index="epochs", columns="seed", values=f"alpha:{name}").rolling(width, min_periods=1).mean()
+            label, style = feature_symbol(name), styles[feature_symbol(name)]
+            axes.plot(runs.index, runs.median(axis=1), label=label, **style)
+            low, high = runs.quantile(0.25, axis=1), runs.quantile(0.75, axis=1)
+            axes.fill_between(runs.index, low, high, color=style["color"], alpha=0.15, linewidth=0)
+            axes.plot(
+                [runs.index[-1]], [printed.loc[name, "published"]], marker="*", markersize=9, color=style["color"], clip_on=False
+            )
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=3, frameon=False, handlelength=2, columnspacing=1)
+        axes.set_title(f"$\\mathbf{{{letter}}}$  Loop of {symbol(loop)}", loc="left")
+        axes.set(xlabel="epoch", ylabel="weight (no unit)" if loop == loops[0] else "", ylim=(-1, 1))
+        axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+        axes.set_label(f"{letter} {loop}")
+    _beside_the_printed(last, printed)
+    last.set_title(f"$\\mathbf{{{ascii_uppercase[len(loops)]}}}$  Learned and printed", loc="left")
+    return figure
+
+
+def _beside_the_printed(axes: Axes, printed: pd.DataFrame) -> None:
+    """Each weight with its interval for one run, by its verdict, and the printed one as a star."""
+    heights = range(0, -len(printed), -1)
+    for y, (name, row) in zip(heights, printed.iterrows(), strict=True):
+        axes.plot([row["pred_low"], row["pred_high"]], [y, y], color=MARKS[row["verdict"]]["color"])
+        axes.plot([row["reproduced"]], [y], label=f"ours {name}", markersize=6, **MARKS[row["verdict"]])
+        axes.plot([row["published"]], [y], label=f"printed {name}", marker="*", markersize=9, color=INK)
+    axes.axvline(0, color=MUTED, linewidth=1)
+    axes.set_yticks(list(heights), [feature_symbol(name) for name in printed.index])
+    axes.set_xlabel("weight (no unit)")
+    axes.set_label("printed")
+    star = Line2D([], [], marker="*", color=INK, linestyle="", markersize=9, label="printed")
+    found = list(dict.fromkeys(printed["verdict"]))
+    place: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.17), "ncols": 2, "frameon": False, "columnspacing": 1}
+    axes.legend(handles=[star, *_handles(found)], **place)

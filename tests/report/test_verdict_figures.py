@@ -1,0 +1,81 @@
+"""Pictures of verdicts: what is drawn is what was handed in, marked by colour and shape."""
+
+from itertools import product
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from helpers.report import verdict_figures
+from helpers.report.verdict_figures import MARKS
+
+NAMES = ["C_A-I", "T-I", "C_A-II", "T-II"]
+VERDICTS = {"expert": "fitted", "policy": "differs", "alpha": "cannot tell"}
+
+
+def compared(cases=(1, 2)):
+    """Ours is a tenth above the published number, the interval reaches from half of it to twice it."""
+    rows = []
+    for case, row, (index, feature) in product(cases, VERDICTS, enumerate(NAMES)):
+        published = -2.0 - index
+        numbers = {"published": published, "reproduced": 0.9 * published, "pred_low": 2 * published, "pred_high": published / 2}
+        verdict = "match" if feature == "T-II" else VERDICTS[row]
+        rows.append({"table": case + 1, "case": case, "row": row, "feature": feature, **numbers, "verdict": verdict})
+    return pd.DataFrame(rows)
+
+
+def test_every_published_number_is_in_the_picture_with_ours_relative_to_it():
+    figure = verdict_figures.comparison_figure(compared())
+    assert [axes.get_label() for axes in figure.axes] == ["Table 2", "Table 3"]
+    for axes in figure.axes:
+        points = {line.get_label(): line for line in axes.lines if line.get_marker() not in ("None", "")}
+        assert set(points) == {f"{row} {name}" for row, name in product(VERDICTS, NAMES)}
+        assert [line.get_xdata()[0] for line in points.values()] == pytest.approx([10.0] * 12)
+        heights = [line.get_ydata()[0] for line in points.values()]
+        assert heights == sorted(heights, reverse=True)
+        assert len(set(heights)) == 12
+        spans = [line.get_xdata() for line in axes.lines if len(line.get_xdata()) == 2 and line.get_marker() == "None"][:12]
+        np.testing.assert_allclose(spans, [[-100.0, 50.0]] * 12)
+        for label, line in points.items():
+            verdict = "match" if label.endswith("T-II") else VERDICTS[label.split()[0]]
+            assert (line.get_marker(), line.get_color()) == (MARKS[verdict]["marker"], MARKS[verdict]["color"])
+    assert len({mark["marker"] for mark in MARKS.values()}) >= 6  # told apart without colours
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["match", "differs", "cannot tell", "fitted"]
+
+
+def test_one_seed_has_points_without_intervals():
+    one = compared((1,)).assign(pred_low=np.nan, pred_high=np.nan)
+    verdict_figures.comparison_figure(one).draw_without_rendering()
+
+
+def test_the_weights_are_drawn_while_they_are_learned_and_beside_the_printed_ones():
+    epochs = np.arange(1, 21)
+    history = pd.concat(
+        [
+            pd.DataFrame({"epochs": epochs, "seed": seed} | {f"alpha:{name}": 0.1 * seed + 0 * epochs for name in NAMES})
+            for seed in range(3)
+        ]
+    )
+    figure = verdict_figures.weights_figure(history, compared((1,)))
+    first, second, last = figure.axes
+    assert [axes.get_label() for axes in figure.axes] == ["A C_A", "B T", "printed"]
+    for axes, loop in ((first, "C_A"), (second, "T")):
+        assert len(axes.lines) == 4
+        np.testing.assert_allclose(axes.lines[0].get_ydata(), 0.1)  # the median over the seeds
+        published = compared((1,)).set_index(["row", "feature"])["published"]
+        assert [line.get_ydata()[0] for line in axes.lines[1::2]] == [published["alpha", f"{loop}-{kind}"] for kind in ("I", "II")]
+    points = {line.get_label(): line.get_xdata()[0] for line in last.lines}
+    assert (points["ours T-I"], points["printed T-I"]) == (pytest.approx(-2.7), -3.0)
+
+
+def test_a_claim_has_a_mark_for_each_case_that_it_speaks_of():
+    rows = [
+        ("One claim", "holds", "in part", ""),
+        ("Another claim that is " + "very " * 30 + "long", "", "does not hold", "cannot tell"),
+    ]
+    judged = pd.DataFrame(rows, columns=["statement", "I", "II", "III"]).assign(section="5", overall="", quantities="")
+    (axes,) = verdict_figures.claims_figure(judged).axes
+    marks = {(line.get_xdata()[0], line.get_label()): line.get_marker() for line in axes.lines}
+    assert len(axes.lines) == 4
+    assert [marks[0, "I"], marks[2, "III"]] == [MARKS["holds"]["marker"], MARKS["cannot tell"]["marker"]]
+    assert [label.get_text().split()[0] for label in axes.get_yticklabels()] == ["One", "Another"]

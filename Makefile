@@ -16,7 +16,7 @@ SNAKEMAKE = $(BIN)/python -m snakemake --profile profiles/local --cores $(CORES)
 # Tests of numbers: what another processor may round otherwise.
 NUMERICAL := tests/plant tests/learning tests/evidence tests/own_plant tests/runs/test_study.py
 
-.PHONY: help setup reports evidence search smoke test portable lock lab bench torture cluster publish notebooks clean
+.PHONY: help setup reports evidence search smoke test portable lock lab browser bench torture cluster publish notebooks clean
 
 help:  ## show this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-10s %s\n", $$1, $$2}'
@@ -69,8 +69,12 @@ lock: setup  ## write pylock.toml from environment.txt: every package of every s
 	$(BIN)/python -m uv pip compile environment.txt --quiet --universal --python-version 3.11.5 --generate-hashes --no-header \
 		--format pylock.toml --output-file pylock.toml
 
-lab: setup  ## open JupyterLab on the notebooks
-	$(BIN)/python -m jupyter lab notebooks
+lab: setup  ## open JupyterLab on the notebooks, with the code and the parameters beside them
+	$(BIN)/python -m jupyter lab --ServerApp.root_dir=. --LabApp.default_url=/lab/tree/notebooks/01_demonstrations.ipynb
+
+browser: setup  ## run every notebook in JupyterLab in Chromium (on Debian: apt-get install chromium); pictures go to results/browser
+	$(BIN)/python -m pip install --quiet --constraint environment.txt --editable ".[browser]"
+	$(BIN)/python -m pytest -rs -m browser tests/notebooks/test_browser.py
 
 bench: setup  ## measure speed against the machine's bound and other ways; writes reports/reference/benchmarks
 	$(BIN)/python -m pip install --quiet --constraint environment.txt --editable ".[bench]"

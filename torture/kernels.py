@@ -44,5 +44,5 @@ def side_by_side(at_once: int, rounds: int) -> Parallel:
 
 def _start(folder: Path, seed: int, environment: dict[str, str]) -> "subprocess.Popen[bytes]":
     command = [sys.executable, "-m", "helpers", "run", NOTEBOOK, str(folder / "01.ipynb"), "-p", "seed", str(seed)]
-    command += ["-p", "output_root", str(folder)]
+    command += ["-p", "scale", "smoke", "-p", "output_root", str(folder)]
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)

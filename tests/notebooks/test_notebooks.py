@@ -37,10 +37,10 @@ def code_of(notebook):
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
 
 
-def test_the_ten_notebooks_are_there():
+def test_the_eleven_notebooks_are_there():
     names = ["00_inferred_settings", "01_demonstrations", "02_offline_irl", "03_online_improvement"]
     names += ["04_knowledge_transfer", "05_report", "06_limits_and_alternatives", "07_your_own_process", "08_claims"]
-    names += ["09_one_policy"]
+    names += ["09_one_policy", "10_sliders"]
     assert sorted(NOTEBOOKS) == names
 
 
@@ -78,6 +78,39 @@ def test_a_notebook_holds_nothing_of_the_machine_or_the_moment(notebook):
 
 def test_a_notebook_was_executed_whole(notebook):
     assert [cell.execution_count for cell in code_of(notebook)] == list(range(1, len(code_of(notebook)) + 1))
+
+
+def stored(name, words, row):
+    """The numbers of a row of a table that a committed notebook shows in the cell whose code holds these words."""
+    (cell,) = [cell for cell in code_of(nbformat.read(NOTEBOOKS[name], as_version=4)) if words in cell.source]
+    (line,) = [line for line in cell.outputs[-1].data["text/plain"].splitlines() if line.strip().startswith(row)]
+    return [float(number) for number in guard.NUMBER.findall(line.split(row, 1)[1])]
+
+
+def test_the_committed_lesson_tells_the_papers_story():
+    """Imitation comes near the expert, and improving on the process passes the PID; also after the transfer."""
+    for name in ("02_offline_irl", "04_knowledge_transfer"):
+        assert stored(name, "session.outcome(", "feature gap, %")[0] < 10
+    for name in ("03_online_improvement", "04_knowledge_transfer"):
+        pid, offline, online, online_on_y, best = stored(name, "tables.quality_table(", "$J$ on $x$ ")
+        assert offline < pid < min(online, online_on_y) < best
+
+
+LINK = re.compile(r"\[([^\]]+)\]\((?!https?:)([^)#]+)\)")
+
+
+def test_every_link_of_a_notebook_leads_somewhere(notebook):
+    texts = [cell.source for cell in notebook.cells if cell.cell_type == "markdown"]
+    if 'scale = "lesson"' in code_of(notebook)[0].source:  # of the others some were not part of the last published run
+        texts += [output.data.get("text/markdown", "") for cell in code_of(notebook) for output in cell.outputs]
+    for _, target in (found for text in texts for found in LINK.findall(text)):
+        assert (PROJECT / "notebooks" / target).exists(), target
+
+
+def test_no_cell_of_a_lesson_is_there_for_the_tests_alone(notebook):
+    sources = [cell.source for cell in code_of(notebook)]
+    if 'scale = "lesson"' in sources[0]:
+        assert not [source for source in sources if "drawn_summary" in source]
 
 
 # How outputs are compared --------------------------------------------------------------------------------------------
@@ -155,11 +188,13 @@ class Copy:
         (found,) = [(number, cell) for number, cell in enumerate(self.code) if words in "".join(cell["source"])]
         return found
 
-    def append(self, words, line):
-        """Put a line of code before the last one of a cell."""
+    def shown(self, words, line):
+        """Let a cell change what it shows by a line of code."""
         number, cell = self.cell(words)
-        *before, last = "".join(cell["source"]).splitlines()
-        cell["source"] = "\n".join([*before, line, last])
+        source = "".join(cell["source"])
+        last = ast.parse(source).body[-1].lineno - 1
+        before, expression = source.splitlines()[:last], source.splitlines()[last:]
+        cell["source"] = "\n".join([*before, "shown = (", *expression, ")", line, "shown"])
         return number
 
     def scale_stored(self, words, factor):
@@ -189,12 +224,15 @@ class Copy:
 
 def test_changed_numbers_fail_and_changed_style_and_last_digits_pass(tmp_path):
     """All in one run, for each cell is judged alone."""
-    copy = Copy("02_offline_irl", tmp_path)
-    wrong = copy.scale_stored("session.outcome(", 1 + 1e-3)
-    copy.scale_stored("scores = session.judge_imitation", 1 + 2e-6)
-    copy.append("curves = figures", "_ = [line.set(color='black', linewidth=4) for axis in curves.axes for line in axis.lines]")
-    copy.append("tracking = figures", "tracking.axes[0].lines[0].set_ydata(tracking.axes[0].lines[0].get_ydata() * 1.001)")
-    plotted, _ = copy.cell("drawn_summary(tracking)")
+    copy = Copy("10_sliders", tmp_path)
+    wrong = copy.scale_stored("places = {", 1 + 1e-3)
+    copy.scale_stored("target = ", 1 + 2e-6)
+    copy.shown(
+        "elsewhere(session, target)", "_ = [line.set(color='black', linewidth=4) for axis in shown.axes for line in axis.lines]"
+    )
+    plotted = copy.shown(
+        'measurement error × 3"], ', "shown.axes[0].lines[0].set_ydata(shown.axes[0].lines[0].get_ydata() * 1.001)"
+    )
     status, failed, said = copy.run()
     assert status == 1, said
     assert failed == [wrong, plotted], said
@@ -220,7 +258,7 @@ def test_another_learning_rate_fails(tmp_path):
 def test_another_seed_fails(tmp_path):
     copy = Copy("01_demonstrations", tmp_path)
     copy.replace("seed = 0", "seed = 1")
-    expected = {copy.cell(words)[0] for words in ("table.describe()", "drawn_summary", "expert = pd.DataFrame")}
+    expected = {copy.cell(words)[0] for words in (".describe()", "bands = table", "expert = pd.DataFrame")}
     status, failed, said = copy.run()
     assert status == 1, said
     assert expected <= set(failed), said

@@ -134,7 +134,8 @@ def disk(tmp_path):
 
 def record(folder, environment=None):
     """Notebook 01 for case 2 with results in `folder`: the exit status and what it said."""
-    words = ["01_demonstrations", str(folder / "01.ipynb"), "-p", "case", "2", "-p", "output_root", str(folder)]
+    words = ["01_demonstrations", str(folder / "01.ipynb"), "-p", "case", "2", "-p", "scale", "smoke"]
+    words += ["-p", "output_root", str(folder)]
     command = [sys.executable, "-m", "helpers", "run", *words]
     done = subprocess.run(command, env={**os.environ, **(environment or {})}, capture_output=True, text=True, check=False)
     return done.returncode, done.stderr.strip()
@@ -150,7 +151,7 @@ def test_a_full_disk_and_a_read_only_one_end_in_a_sentence_and_the_run_resumes(s
         status, said = record(folder)
         assert status == 1
         assert cause in said.splitlines()[-1]
-        assert said.splitlines()[-1].startswith("error: 01_demonstrations case=2: ")
+        assert said.splitlines()[-1].startswith("error: 01_demonstrations case=2 scale=smoke: ")
         assert "Traceback" not in said
         again("rw,size=20m")
         assert list(folder.rglob("record.json")) == []

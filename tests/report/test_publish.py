@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from helpers.report import publish
-from helpers.report.publish import PublishError, check
+from helpers.report.publish import PublishError, check, relinked
 from helpers.runs.sources import PROJECT
 
 REVISION = "0123abcd" * 5
@@ -279,3 +279,15 @@ def test_git_sees_nothing_of_what_a_kill_leaves_beside_the_reference():
     if ignored.returncode == 128:
         pytest.skip("no checkout")
     assert ignored.stdout.split() == left
+
+
+@pytest.mark.parametrize(
+    ("link", "copy"),
+    [
+        ("[code](../src/helpers/x.py)", "[code](../../../src/helpers/x.py)"),
+        ("[next](03_online_improvement.ipynb)", "[next](../../../notebooks/03_online_improvement.ipynb)"),
+        ("[paper](https://doi.org/10.1002/x)", "[paper](https://doi.org/10.1002/x)"),
+    ],
+)
+def test_links_of_an_executed_copy_lead_where_they_led_from_the_notebook(link, copy):
+    assert relinked(f'"See {link}, and {link}."') == f'"See {copy}, and {copy}."'

@@ -65,10 +65,10 @@ def test_a_warning_in_an_executed_copy_names_no_folder_of_the_machine(tmp_path):
 
 
 def test_a_notebook_runs_from_any_directory_and_leaves_no_trace_of_the_machine(here, capfd):
-    arguments = ["01_demonstrations", "copies/01.ipynb", "-p", "case", "2", "-p", "seed", "5"]
+    arguments = ["01_demonstrations", "copies/01.ipynb", "-p", "case", "2", "-p", "seed", "5", "-p", "scale", "smoke"]
     arguments += ["-p", "output_root", str(here / "out")]
     assert run.main(arguments) == 0
-    assert capfd.readouterr().out.strip() == "done: 01_demonstrations case=2 seed=5"
+    assert capfd.readouterr().out.strip() == "done: 01_demonstrations case=2 seed=5 scale=smoke"
     stage = load_stage(here / "out/smoke/seed_5/case_2/demonstrations", "notebook 01")
     assert {"notebook": "01_demonstrations", "case": 2, "seed": 5, "scale": "smoke"}.items() <= stage.record.items()
     assert everything_below(here / "copies") == ["01.ipynb"]
@@ -154,7 +154,7 @@ def test_a_missing_result_ends_in_a_sentence_and_keeps_the_executed_copy(here, c
     arguments = ["02_offline_irl", "copies/02.ipynb", *roots[0], *roots[1]]
     assert run.main(arguments) == 1
     said = capfd.readouterr().err.strip()
-    missing = here / "nothing/smoke/seed_0/case_1/demonstrations/record.json"
+    missing = here / "nothing/lesson/seed_0/case_1/demonstrations/record.json"
     sentence = f"ArtifactError: {missing}: this result is missing; run 01_demonstrations for case 1 first"
     assert said.splitlines()[-1] == f"error: 02_offline_irl: {sentence} (executed copy with the traceback: copies/02.ipynb)"
     assert everything_below(here) == ["copies", "copies/02.failed", "copies/02.ipynb"]
@@ -318,7 +318,7 @@ EDITS = [
     ("params/learning.yaml", "std_high: {value: 0.25", "std_high: {value: 0.3", ONLINE),
     ("params/learning.yaml", "episodes: {value: 400", "episodes: {value: 300", {"report": 1}),  # of another scale
     ("params/published.yaml", "21.63", "21.64", {"report": 1}),
-    ("notebooks/04_knowledge_transfer.ipynb", "carried = ", "taken = ", {"transfer": 1, "transfer_alone": 1}),
+    ("notebooks/04_knowledge_transfer.ipynb", "offline_response = ", "response_before = ", {"transfer": 1, "transfer_alone": 1}),
     ("src/helpers/learning/algorithm_2.py", ADDED, "# a comment\n", {}),
     ("src/helpers/learning/algorithm_2.py", '"""Algorithm 2', '"""The algorithm 2', {}),  # a docstring
     ("src/helpers/report/tables.py", "def ", "def _(): ...\n\n\ndef ", {"report": 1}),

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from helpers.runs.artifacts import save_stage
-from helpers.runs.opening import open_report, parameters_hash
+from helpers.runs.opening import open_report, parameters_hash, readable
 from helpers.runs.request import NOTEBOOK_PARAMETERS, SessionError, check_parameters
 from helpers.runs.session import open_session
 from helpers.runs.sources import PROJECT
@@ -16,6 +16,7 @@ from helpers.settings.leaf import ParameterError
 
 NOTEBOOKS = sorted(path.stem for path in (PROJECT / "notebooks").glob("[0-9]*.ipynb"))
 OFFLINE, REPORT = "02_offline_irl", "05_report"
+TAUGHT = [name for name in NOTEBOOKS if name[:2] in ("01", "02", "03", "04", "10")]
 OF_ALL_CASES = {REPORT: ("seeds",), "00_inferred_settings": ("seed",), "07_your_own_process": ("seed",), "09_one_policy": ("seed",)}
 
 
@@ -30,7 +31,8 @@ def defaults(notebook):
 
 def globals_of_a_kernel(notebook, **given):
     """A notebook's globals after its parameters cell, with what IPython and papermill add."""
-    return {"__name__": "__main__", "In": [""], "Out": {}, "_": "", "_i1": "case = 1", "quit": exit, **defaults(notebook), **given}
+    ipython = {"__name__": "__main__", "In": [""], "Out": {}, "_": "", "_i1": "case = 1", "quit": exit}
+    return {**ipython, **defaults(notebook), "scale": "smoke", **given}
 
 
 def refusal(action, *arguments):
@@ -48,8 +50,13 @@ def test_the_parameters_cell_names_known_parameters_of_the_right_type(notebook):
     assert set(found) <= set(NOTEBOOK_PARAMETERS)
     assert {"scale", "input_root", "output_root", "params_root"} <= set(found)
     assert set(OF_ALL_CASES.get(notebook, ("case", "seed"))) == {"case", "seed", "seeds"} & set(found)
-    assert found["scale"] == "smoke"
+    assert found["scale"] == ("lesson" if notebook in TAUGHT else "smoke")
     check_parameters(notebook, found)
+
+
+@pytest.mark.parametrize("notebook", [name for name in NOTEBOOKS if name not in TAUGHT])
+def test_the_lesson_is_refused_where_there_is_none(notebook):
+    assert "'scale': expected one of paper, smoke, found 'lesson'" in refusal(check_parameters, notebook, {"scale": "lesson"})
 
 
 WRONG = {
@@ -88,13 +95,15 @@ def test_a_parameter_of_another_notebook_is_refused(notebook, given):
     assert f"'{name}'" in refusal(check_parameters, notebook, given)
 
 
-@pytest.mark.parametrize("scale", ["smoke", "paper"])
+@pytest.mark.parametrize("scale", ["smoke", "lesson", "paper"])
 def test_default_roots_do_not_depend_on_the_working_directory(monkeypatch, tmp_path, scale):
     monkeypatch.chdir(tmp_path)
     session = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, scale=scale))
-    assert session.input_root == PROJECT / ("notebooks/inputs" if scale == "smoke" else "results")
+    assert session.input_root == PROJECT / ("results" if scale == "paper" else "notebooks/inputs")
     assert session.output_root == PROJECT / "results"
     assert session.params_root == PROJECT / "params"
+    if scale == "lesson":
+        return
     report = open_report(REPORT, globals_of_a_kernel(REPORT, scale=scale))
     assert report.input_root == session.input_root
     assert report.output_root == PROJECT / ("results/smoke/report" if scale == "smoke" else "reports/latest")
@@ -151,7 +160,29 @@ def test_the_parameter_hash_changes_with_values_and_not_with_sources(tmp_path):
     assert hashed("learning_rate_start: {value: 1.0e-2", "learning_rate_start: {value: 0.9e-2") != same
 
 
+@pytest.mark.parametrize(
+    ("label", "shown"),
+    [
+        ("alpha:C_A-I", "alpha of <i>C</i><sub>A</sub>-I"),
+        ("rise_time:T", "rise time of T"),
+        ("C_A0", "<i>C</i><sub>A0</sub>"),
+        ("params/case_1.yaml", "params/case_1.yaml"),
+        ("$C_{A0}^*$", "$C_{A0}^*$"),
+        ("a < b", "a &lt; b"),
+        ("12:30:00", "12:30:00"),
+    ],
+)
+def test_a_table_is_shown_in_words_and_four_digits(label, shown):
+    table = pd.DataFrame({label: [1.23456789, float("nan"), 123456.7]}, index=["first", label, "last"])
+    text = readable(table)
+    assert text.count(f"<th>{shown}</th>") == 2
+    assert [value in text for value in ("<td>1.235</td>", "<td>–</td>", "<td>123,457</td>")] == [True] * 3
+
+
 def test_the_banner_says_smoke_and_links_the_full_run():
+    lesson = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, scale="lesson")).banner().data
+    assert "This is the lesson" in lesson
+    assert "(../reports/reference/notebooks/02_offline_irl_case_1.ipynb)" in lesson
     smoke = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, case=2)).banner().data
     assert "smoke run" in smoke
     assert "(../reports/reference/notebooks/02_offline_irl_case_2.ipynb)" in smoke

@@ -1,7 +1,8 @@
 """Figures 3-6, learning curves and the curve of the online budget.
 
 Every table may hold several runs, told apart by a column `seed`: each is then a thin line, their median a thick one. Every
-figure is drawn from tables and computes no result; `drawn_summary` reads back what was really drawn.
+figure is drawn from tables and computes no result; `drawn_summary` reads back what was really drawn, and is the text form of
+every figure: a notebook shows the picture, and the numbers beneath it are what a later run is compared with.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +15,7 @@ import pandas as pd
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, QuadMesh
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -273,12 +274,13 @@ def drawn_summary(figure: Figure) -> pd.DataFrame:
     """What the figure really shows, read back from its lines and bands: a row for each.
 
     Columns: panel, artist (its label), points, from and to (least and greatest x), then of y: first, minimum, maximum,
-    mean, last. The points of a band are those of its outline.
+    mean, last. The points of a band are those of its outline. Heat maps are left out: their cells lie where they always do.
     """
     rows = []
     for axes in figure.axes:
         panel = axes.get_label() or axes.get_title(loc="left") or axes.get_title()
-        outlines = [(band.get_label(), path.vertices) for band in axes.collections for path in band.get_paths()]
+        bands = [band for band in axes.collections if not isinstance(band, QuadMesh)]
+        outlines = [(band.get_label(), path.vertices) for band in bands for path in band.get_paths()]
         for label, points in [*((line.get_label(), line.get_xydata()) for line in axes.lines), *outlines]:
             x, y = np.asarray(points, dtype=float).T
             values = {"first": y[0], "minimum": np.nanmin(y), "maximum": np.nanmax(y), "mean": np.nanmean(y), "last": y[-1]}
@@ -287,9 +289,19 @@ def drawn_summary(figure: Figure) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=columns)
 
 
+class DrawnFigure(Figure):
+    """A figure whose text form holds the numbers that it shows."""
+
+    def __repr__(self) -> str:
+        """As usual, and `drawn_summary` below, to six digits, where anything is drawn to scale."""
+        drawn = drawn_summary(self)
+        numbers = "" if drawn.empty else drawn.to_string(index=False, float_format="{:.6g}".format)
+        return f"{super().__repr__()}\n{numbers}".strip()
+
+
 def empty_figure(width: float, height: float) -> Figure:
     """An empty figure that pyplot forgets at once, so that a notebook shows it once and many figures cost no memory."""
-    figure = plt.figure(figsize=(width, height), layout="constrained")
+    figure = plt.figure(figsize=(width, height), layout="constrained", FigureClass=DrawnFigure)
     plt.close(figure)
     return figure
 

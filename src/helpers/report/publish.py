@@ -22,6 +22,7 @@ LIMITS = "tables/limits_gaps.csv"
 # Of README's gaps to the optimum:
 SHOWN = ("expert", "online", *LEARNERS, "mpc", "minimum_variance", "dynamic_programme_filtered")
 LEARNT, VARIANTS = re.compile(r"0[24]_(?:offline_irl|knowledge_transfer)_(\w+)"), ("improved", "printed")
+LINK = re.compile(r"\]\((?:(\.\./)|(?=\d\d_\w+\.ipynb\)))")
 PARTS = ("report.html", "report.pdf", "report.md", "figures", "tables", "comparison.csv", "seeds.csv", "provenance.json")
 
 
@@ -148,6 +149,11 @@ def executed_copies(first: Path) -> dict[str, Path]:
     return copies
 
 
+def relinked(text: str) -> str:
+    """A notebook whose links lead from the folder of the executed copies to where they led from notebooks/."""
+    return LINK.sub(lambda found: "](../../../" if found[1] else "](../../../notebooks/", text)
+
+
 def publish() -> None:
     """Check the last run, put it in the place of the reference and its numbers into README and docs.
 
@@ -171,7 +177,9 @@ def publish() -> None:
     for part in PARTS:
         _copy(LATEST / part, partial / part)
     for name, path in copies.items():
-        _copy(path, partial / "notebooks" / name)
+        target = partial / "notebooks" / name
+        _copy(path, target)
+        target.write_text(relinked(target.read_text(encoding="utf-8")), encoding="utf-8")
     if (first / "inferred_settings").is_dir():
         _copy(first / "inferred_settings", partial / "inferred_settings")
     for part in ("benchmarks", "inferred_settings", "reliability.md", "search"):  # runs of their own, which stay

@@ -1,5 +1,7 @@
 """What every run of a notebook begins with: its parameters, checked, and where its results come from and go."""
 
+import html
+import re
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,6 +10,7 @@ from typing import Any
 
 import pandas as pd
 import torch
+from IPython import get_ipython
 from IPython.display import Markdown
 from matplotlib.figure import Figure
 from torch import nn
@@ -18,10 +21,13 @@ from helpers.runs.identity import changes, digest, identity, inputs, versions
 from helpers.runs.request import NOTEBOOK_PARAMETERS, SessionError, check_parameters, parameter_names
 from helpers.runs.sources import PROJECT
 from helpers.settings.evidence import IdentificationParams, IdentificationScaleParams, load_identification
+from helpers.settings.leaf import LESSON
 from helpers.settings.paper import Params, PublishedCase, ScaleParams, load, load_published
 
 PLAIN = (str, int, float, list, dict, type(None))
 IPYTHON_NAMES = ("In", "Out")
+OF_THE_MACHINE = ("number_type", "threads")  # settings of a scale that tell a reader nothing
+VARIABLE = re.compile(r"(?<![A-Za-z])([A-Z])_([A-Z]\w*)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,9 +116,11 @@ class Run:
         return Finished(self.folder(self.output_root, hidden), digest([self.made_from, *self.given.values()]))
 
     def settings_table(self, scale_params: ScaleParams | IdentificationScaleParams) -> pd.DataFrame:
-        """What the notebook was run with. Columns: setting, value."""
-        scale = {f"scale.{key}": value for key, value in scale_params.model_dump().items()}
-        return pd.DataFrame([{"setting": key, "value": str(value)} for key, value in (self.given | scale).items()])
+        """What the notebook was run with: a row for each setting that tells a reader something."""
+        scale = {key: value for key, value in scale_params.model_dump(exclude_none=True).items() if key not in OF_THE_MACHINE}
+        return pd.DataFrame(
+            [{"setting": key.replace("_", " "), "value": str(value)} for key, value in (self.given | scale).items()]
+        )
 
     def banner_of(self, what: str, measure: str, copy: str) -> Markdown:
         """What kind of run this is, for the top of the notebook; `measure`: of which the smoke run has few."""
@@ -122,9 +130,13 @@ class Run:
 
 
 def _banner(scale: str, what: str, smoke: str, full: str, link: str) -> Markdown:
-    if scale != "smoke":
+    small = {
+        "smoke": f"the smoke run: {smoke}",
+        LESSON: "the lesson: fewer episodes and epochs than the paper's, and the same story.",
+    }
+    if scale not in small:
         return Markdown(f"**{what}, scale `{scale}`.**")
-    return Markdown(f"**{what}. This is the smoke run: {smoke}** The full run's {full} is [{link}](../{link}).")
+    return Markdown(f"**{what}. This is {small[scale]}** The full run's {full} is [{link}](../{link}).")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,13 +203,34 @@ def checked(notebook: str, namespace: dict[str, Any]) -> tuple[dict[str, Any], P
     # Whole tables in the plain text of an output too, which is what nbval compares.
     pd.set_option("display.max_columns", None, "display.width", 200, "display.max_rows", 400, "display.max_colwidth", 120)
     pd.set_option("display.float_format", "{:.6g}".format)
+    if shell := get_ipython():
+        shell.display_formatter.formatters["text/html"].for_type(pd.DataFrame, readable)
     torch.set_num_threads(params.learning.scales[given["scale"]].threads)
     return given, params
 
 
+def readable(table: pd.DataFrame) -> str:
+    """A table as HTML for a reader: four digits, variables with their index, no underscores, a dash where there is no number."""
+    shown = table.rename_axis(index=_words, columns=_words).map(_words).rename(index=_words, columns=_words)
+    numbers: dict[str, Any] = {
+        "float_format": lambda value: f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.4g}",
+        "na_rep": "–",
+    }
+    return str(shown.to_html(escape=False, border=0, **numbers))
+
+
+def _words(label: Any) -> Any:
+    """alpha:C_A-I becomes alpha of C_A-I with the A as an index; what is no text, a key of a file, or TeX stays as it is."""
+    if not isinstance(label, str) or re.search(r"[.$]|: ", label):
+        return html.escape(label, quote=False) if isinstance(label, str) else label
+    words = re.sub(r"(?<=[a-z]):(?=[A-Za-z])", " of ", html.escape(label, quote=False))
+    return VARIABLE.sub(r"<i>\1</i><sub>\2</sub>", words).replace("_", " ")
+
+
 def roots_of(given: Mapping[str, Any], output: str = "results") -> dict[str, Any]:
     """The folders that a notebook was given, or their defaults."""
-    defaults = {"input_root": "notebooks/inputs" if given["scale"] == "smoke" else "results", "output_root": output}
+    committed = given["scale"] in ("smoke", LESSON)
+    defaults = {"input_root": "notebooks/inputs" if committed else "results", "output_root": output}
     return {
         name: Path(given.get(name) or PROJECT / default).resolve()
         for name, default in (defaults | {"params_root": "params"}).items()

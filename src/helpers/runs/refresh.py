@@ -1,6 +1,7 @@
 """Run the notebooks at their defaults and store the outputs in them: `python -m helpers refresh`.
 
-The committed notebooks are the smoke run on the small inputs in notebooks/inputs. Those are made first, by the smoke run.
+The committed notebooks are the lesson (01 to 04 and 10) and the smoke run (the others), on the small inputs in notebooks/inputs.
+Those are made first: all of the smoke run, and of the lesson what other notebooks read.
 """
 
 import argparse
@@ -16,15 +17,18 @@ from helpers.runs.run import NOTEBOOKS, execute
 from helpers.runs.sources import PROJECT
 
 INPUTS = NOTEBOOKS / "inputs"
+LESSON = ("case_1/online_improved", "case_2/online_improved", "case_3/demonstrations")  # and what they are made from
 
 
 def make_inputs() -> None:
-    """Run all stages at smoke scale into a fresh folder and put what they wrote into notebooks/inputs."""
+    """Run the stages at both scales into a fresh folder and put what they wrote into notebooks/inputs."""
     with tempfile.TemporaryDirectory() as folder:
-        config = ["seeds=1", "scale=smoke", f"results={folder}/results", f"reports={folder}/report"]
-        snakemake = [sys.executable, "-m", "snakemake", "--profile", "profiles/local", "--cores", str(os.cpu_count()), "--nolock"]
-        more = f"{folder}/results/smoke/seed_0/case_1/one_policy/record.json"  # notebook 06 reads it
-        subprocess.run([*snakemake, "--config", *config, "--", "all", more], cwd=PROJECT, check=True)
+        place = f"{folder}/results/{{}}/seed_0/{{}}/record.json"
+        lesson = [place.format("lesson", stage) for stage in LESSON]
+        for scale, targets in (("smoke", ["all", place.format("smoke", "case_1/one_policy")]), ("lesson", lesson)):  # 06 reads it
+            config = ["seeds=1", f"scale={scale}", f"results={folder}/results", f"reports={folder}/report"]
+            options = ["--profile", "profiles/local", "--cores", str(os.cpu_count()), "--nolock", "--config"]
+            subprocess.run([sys.executable, "-m", "snakemake", *options, *config, "--", *targets], cwd=PROJECT, check=True)
         shutil.rmtree(INPUTS, ignore_errors=True)
         shutil.copytree(Path(folder) / "results", INPUTS, ignore=shutil.ignore_patterns("notebooks"))
 

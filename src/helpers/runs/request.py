@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from helpers.runs.sources import PROJECT, notebook_path
-from helpers.settings.leaf import InputError
+from helpers.settings.leaf import LESSON, InputError
 from helpers.settings.paper import Params, load
 
 NOTEBOOK_PARAMETERS = {
@@ -21,6 +21,7 @@ NOTEBOOK_PARAMETERS = {
     "output_root": str,
     "params_root": str,
 }
+TAUGHT = ("01", "02", "03", "04", "10")  # the notebooks that have a lesson
 WRITABLE, COMMITTED = ("results", "reports"), ("reports/template", "reports/reference")
 
 
@@ -60,8 +61,9 @@ def check_parameters(notebook: str, given: Mapping[str, Any]) -> Params:
     check_place("output_root", Path(given.get("output_root") or PROJECT / "results"))
     params = load(Path(given.get("params_root") or PROJECT / "params").resolve(), given.get("case", 1))
     variants = [name for name in params.learning.variants if name not in params.trials]
+    scales = [name for name in params.learning.scales if name != LESSON or notebook.startswith(TAUGHT)]
     for name, known, shown in (
-        ("scale", params.learning.scales, list(params.learning.scales)),
+        ("scale", scales, scales),
         ("variant", params.learning.variants, [*variants, "a trial of params/trials.yaml"] if params.trials else variants),
     ):
         if name in given and given[name] not in known:

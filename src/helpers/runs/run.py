@@ -31,6 +31,7 @@ from helpers.settings.paper import HEADLINE
 
 NOTEBOOKS = PROJECT / "notebooks"
 DAY = 86400.0  # seconds
+WIDGET = "application/vnd.jupyter.widget-view+json"
 
 
 def execute(notebook: str, output: Path, parameters: dict[str, Any]) -> None:
@@ -97,7 +98,7 @@ def _forget_finished(notebook: str, parameters: dict[str, Any]) -> None:
 
 
 def strip_machine(path: Path) -> None:
-    """Take papermill's paths and times out of an executed notebook, so that it can be compared and published; pictures shrink."""
+    """Take papermill's paths and times, and widgets, out of an executed notebook, so that it can be compared; pictures shrink."""
     notebook = nbformat.read(path, as_version=4)
     for name in ("papermill", "widgets"):
         notebook.metadata.pop(name, None)
@@ -111,6 +112,8 @@ def strip_machine(path: Path) -> None:
             cell.metadata["tags"] = tags
         else:
             cell.metadata.pop("tags", None)
+        if "outputs" in cell:  # a widget lives in the kernel that made it
+            cell.outputs = [output for output in cell.outputs if WIDGET not in output.get("data", {})]
         for output in cell.get("outputs", []):
             if picture := output.get("data", {}).get("image/png"):
                 output.data["image/png"] = base64.b64encode(smaller(base64.b64decode(picture))).decode() + "\n"

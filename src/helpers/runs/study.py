@@ -117,6 +117,11 @@ class Study:
         """How many of the paper's epochs this scale runs."""
         return max(1, round(full * self.scale_params.epoch_share))
 
+    def online_epochs(self) -> list[int]:
+        """How many epochs of each round of online learning this scale runs."""
+        share = self.scale_params.online_share or self.scale_params.epoch_share
+        return [max(1, round(full * share)) for full in self.params.case.online.epochs]
+
     def stream(self, *purpose: str) -> torch.Generator:
         """The random stream of this seed and case for one purpose."""
         return stream(self.seed, self.case, *purpose)
@@ -220,7 +225,7 @@ class Study:
         `episodes` an epoch, each a run of the plant, are those of the parameter files unless given.
         """
         online = self.params.case.online
-        epochs = [self.epochs(n_epochs) for n_epochs in online.epochs]
+        epochs = self.online_epochs()
         generator = self.stream("online", self.variant, features_on)
         learner = self.online_learner(policy, self.online_episodes(episodes), sum(epochs), generator, features_on)
 

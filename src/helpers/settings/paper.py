@@ -122,7 +122,7 @@ class PolicyParams(ExplorationParams):
 
 
 class ScaleParams(Record):
-    """How much is computed: the smoke run or the paper's."""
+    """How much is computed: the smoke run, the lesson or the paper's. Of online epochs the `online_share`, if there is one."""
 
     number_type: Annotated[Literal["float32", "float64"], Leaf("-")]
     threads: Annotated[Count, Leaf("threads")]
@@ -132,6 +132,7 @@ class ScaleParams(Record):
     evaluation: Annotated[Count, Field(gt=1), Leaf("trajectories")]
     expert_evaluation: Annotated[Count, Field(gt=1), Leaf("trajectories")]
     epoch_share: Annotated[Share, Leaf("-")]
+    online_share: Annotated[Share, Leaf("-")] | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

@@ -322,7 +322,7 @@ EDITS = [
     ("src/helpers/learning/algorithm_2.py", ADDED, "# a comment\n", {}),
     ("src/helpers/learning/algorithm_2.py", '"""Algorithm 2', '"""The algorithm 2', {}),  # a docstring
     ("src/helpers/report/tables.py", "def ", "def _(): ...\n\n\ndef ", {"report": 1}),
-    ("reports/template/report.md.jinja", "# In one page", "# In a page", {}),  # Snakemake looks at it by itself
+    ("reports/template/report.md.jinja", "# The reproduction", "# A reproduction", {}),  # Snakemake looks at it by itself
     ("src/helpers/learning/algorithm_2.py", "return project(self.mean)", "return project(self.mean.clone())", LEARNT),
     ("src/helpers/report/report.py", "RUNNERS = (", "RUNNERS = (*(),", {"report": 1}),
     ("src/helpers/report/figures.py", "MUTED = ", "MUTED: str = ", {"report": 1}),
@@ -350,7 +350,7 @@ def test_a_change_makes_exactly_the_results_stale_that_are_made_from_it(source):
         ("params/case_2.yaml", "250", "249", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
         pytest.param("src/helpers/learning/algorithm_2.py", ADDED, "# a comment\n", {}, marks=SLOW),
         pytest.param("src/helpers/learning/algorithm_2.py", "(self.mean)", "(+self.mean)", ONE_SEED, marks=SLOW),
-        pytest.param("reports/template/report.md.jinja", "# In one page", "# In a page", {"report": 1}, marks=SLOW),
+        pytest.param("reports/template/report.md.jinja", "# The reproduction", "# A reproduction", {"report": 1}, marks=SLOW),
     ],
 )
 def test_what_is_stale_is_run_again_with_all_that_read_it(finished, changed, old, new, jobs):

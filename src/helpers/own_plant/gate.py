@@ -61,9 +61,8 @@ def judge(
                 moved = movement
             parts = {"mean |e|": errors[name] / errors[RECORD], "movement": movement / moved}
             models.append(pd.DataFrame(parts).assign(controller=name))
-            at_corners[name] = (
-                operation.error(track(tracker, corners, operation.bounds)).double().reshape(-1, params.corner_episodes)
-            )
+            at_ends = operation.error(track(tracker, corners, operation.bounds)).double()
+            at_corners[name] = at_ends.reshape(-1, params.corner_episodes).mean(1)
             rest = offsets(track(tracker, quiet, operation.bounds), operation)
             rows[name] = {
                 "mean |e|": (errors[name] / errors[RECORD]).mean().item(),

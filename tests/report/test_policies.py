@@ -35,9 +35,8 @@ def written(tmp_path_factory, study):
     gains = Gains(*(size * torch.eye(2, dtype=torch.float64) for size in (5.0, 3.0, 0.0)))
     middle, reach = (target.amax(0) + target.amin(0)) / 2, (target.amax(0) - target.amin(0)) / 2
     torch.manual_seed(0)
-    policy = TrackingPolicy(
-        cases[1].params.learning.policy, gains, task.set_point.abs(), middle, reach, Bounds(task.input_low, task.input_high, reach)
-    )
+    bounds = Bounds(task.input_low, task.input_high, reach)
+    policy = TrackingPolicy(cases[1].params.learning.policy, gains, task.set_point.abs(), middle, reach, bounds, kept=0.8)
     torch.nn.init.normal_(policy.output.weight, std=0.1)
     record = {"notebook": "09_one_policy", "seed": 0, "scale": "smoke", "revision": "0"}
     save_stage(first / "case_1/one_policy", record, {}, policy)

@@ -62,7 +62,8 @@ def rebuilt(params: PolicyParams, state: dict[str, Tensor]) -> LSTMPolicy | Trac
     policy: LSTMPolicy | TrackingPolicy
     if "integral" in state:
         gains, bounds = Gains(*[state["integral"]] * 3), Bounds(state["low"], state["high"], state["high"])  # its rate is not used
-        policy = TrackingPolicy(params, gains, state["unit"], state["centre"], state["reach"], bounds)
+        kept = 0.5 if "kept_logit" in state else None  # the patient form; its value is in the state
+        policy = TrackingPolicy(params, gains, state["unit"], state["centre"], state["reach"], bounds, kept)
     else:
         n_u = len(state["output.bias"]) // 2  # of each input the mean and the standard deviation
         policy = LSTMPolicy(params, state["layers.0.weight_ih_l0"].shape[1] - n_u, n_u).to(state["output.bias"].dtype)

@@ -10,6 +10,7 @@ from jax.nn import leaky_relu, relu6, sigmoid
 from torch import Tensor
 
 from helpers.learning.learner import Learner
+from helpers.plant.process import LinearProcess
 
 
 class JaxLearner:
@@ -18,8 +19,11 @@ class JaxLearner:
     def __init__(self, learner: Learner, alpha: Tensor) -> None:
         """`alpha`: weights of the reward, shape (d,)."""
         self.features, self.params, self.policy = learner.features, learner.params, learner.policy.params
-        names = ("state_step", "input_step", "disturbance_gain", "observation_noise")
-        self.process: dict[str, np.ndarray] = {name: getattr(learner.process, name).numpy() for name in names}
+        names = ("drift_state", "drift_input", "disturbance_gain", "observation_noise")
+        process = learner.process
+        assert isinstance(process, LinearProcess)
+        self.steps, self.h = process.integration_steps, process.sampling_time / process.integration_steps
+        self.process: dict[str, np.ndarray] = {name: getattr(process, name).numpy() for name in names}
         self.task = {name: value.numpy() for name, value in vars(self.features.task).items() if name != "n_steps"}
         self.task["error_unit"] = learner.policy.error_unit.numpy()
         self.alpha, self.shape = alpha.numpy(), (self.features.task.n_steps, learner.n_episodes)
@@ -29,8 +33,8 @@ class JaxLearner:
 
     def noise(self, key: jax.Array) -> dict[str, jax.Array]:
         """All random numbers of a batch, standard normal: of start, process, sensors and exploration; time first."""
-        (T, K), (n_x, n_u) = self.shape, self.process["input_step"].shape
-        shapes = {"start": (K, n_x), "process": (T, K, n_x), "sensors": (T + 1, K, n_x), "exploration": (T, K, n_u)}
+        (T, K), (n_x, n_u) = self.shape, self.process["drift_input"].shape
+        shapes = {"start": (K, n_x), "process": (T, K, self.steps * n_x), "sensors": (T + 1, K, n_x), "exploration": (T, K, n_u)}
         keys = jax.random.split(key, len(shapes))
         return {name: jax.random.normal(key, shape) for key, (name, shape) in zip(keys, shapes.items(), strict=True)}
 
@@ -61,8 +65,10 @@ class JaxLearner:
             command = jax.lax.stop_gradient(mean + std * exploration)
             log_probability = (-(((command - mean) / std) ** 2) / 2 - jnp.log(std) - np.log(2 * np.pi) / 2).sum(-1)
             u = jnp.clip(command, task["input_low"], task["input_high"])
-            kick = process["disturbance_gain"] * self.features.sampling_time**0.5 * x * disturbance
-            after = x @ process["state_step"].T + u @ process["input_step"].T + kick
+            after = x
+            for w in jnp.split(disturbance, self.steps, axis=-1):
+                drift = after @ process["drift_state"].T + u @ process["drift_input"].T
+                after = after + drift * self.h + process["disturbance_gain"] * self.h**0.5 * after * w
             seen = after * (1 + process["observation_noise"] * sensors)
             return (after, seen, u, following), (log_probability, {"x": after, "y": y, "u": u, "command": command})
 

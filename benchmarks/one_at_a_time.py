@@ -68,7 +68,7 @@ def episode(policy: StepwisePolicy, process: Process, generator: torch.Generator
         log_probability = -(((command - mean) / std) ** 2) / 2 - std.log() - math.log(2 * math.pi) / 2
         log_probabilities.append(log_probability.sum(-1))
         u = command.clamp(task.input_low, task.input_high)
-        x = process.step(x, u, normal(process.n_states))
+        x = process.step(x, u, normal(process.n_disturbances))
         y = process.observe(x, normal(process.n_outputs))
         xs.append(x)
         ys.append(y)

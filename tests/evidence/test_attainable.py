@@ -6,16 +6,35 @@ import torch
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from helpers.evidence.attainable import Resolution, Tabulated, dynamic_programme, expected_closeness, grid_around, one_step
+from helpers.evidence.attainable import (
+    Resolution,
+    Tabulated,
+    coefficients,
+    dynamic_programme,
+    expected_closeness,
+    expected_value,
+    grid_around,
+    one_step,
+)
 from helpers.learning.evaluation import objective
+from helpers.learning.features import tracking_reward
 from helpers.plant.controllers import MinimumVariance
 from helpers.plant.rollout import rollout, stream
 
 
 @pytest.mark.parametrize(("mean", "std", "beta"), [(0.0, 0.1, 30.0), (0.05, 0.06, 30.0), (-0.4, 0.3, 10.0), (0.2, 1e-9, 10.0)])
 def test_the_expected_reward_is_the_integral(mean, std, beta):
-    """Against quadrature over the density, where that is not a spike."""
+    """Against quadrature over the density, where that is not a spike; with a third moment over the series of Gram and Charlier."""
     found = expected_closeness(np.array(mean), np.array(std), beta)
+    skewness = 0.3
+
+    def skewed(e):
+        z = (e - mean) / std
+        return np.exp(-((beta * e) ** 2)) * norm.pdf(z) / std * (1 + skewness / 6 * (z**3 - 3 * z))
+
+    if std > 1e-6:
+        tilted = quad(skewed, mean - 9 * std, mean + 9 * std, points=[0.0])[0]
+        assert expected_closeness(np.array(mean), np.array(std), beta, skewness * std**3) == pytest.approx(tilted, rel=1e-6)
     if std < 1e-6:
         expected = np.exp(-((beta * mean) ** 2))
     else:
@@ -25,26 +44,28 @@ def test_the_expected_reward_is_the_integral(mean, std, beta):
     assert found == pytest.approx(expected, rel=1e-6)
 
 
-def test_rewards_and_transitions_are_those_of_the_process(study):
-    """Monte Carlo through the process itself: reward and the expectation of a cubic, which a cubic spline holds exactly."""
+@pytest.mark.parametrize(("beta", "place", "tried"), [(10.0, 3 * 9 + 6, (4, 0)), (30.0, 3 * 9 + 5, (3, 0))])
+def test_rewards_and_transitions_are_those_of_the_process(study, beta, place, tried):
+    """Monte Carlo through the process itself: the reward, and the expectation of what a cubic spline holds exactly."""
     case = study(1)
     axes = (np.linspace(-4, 3, 9), np.linspace(-8, 12, 9))
-    step = one_step(case.process, case.task, 10.0, axes, Resolution(9, 3, 5))
-    place, tried = 9 * 3 + 6, (2, 0)  # the state (axes[0][3], axes[1][6]) and the inputs at the upper and the lower bound
-    x = torch.tensor([[axes[0][3], axes[1][6]]], dtype=torch.float64).expand(200_000, -1)
-    u = torch.tensor([[step.inputs[0, 2], step.inputs[1, 0]]], dtype=torch.float64).expand(200_000, -1)
-    after = case.process.step(x, u, torch.randn(x.shape, generator=stream(0, "step"), dtype=torch.float64))
-    error = (case.task.set_point - after) / case.task.error_scale
-    rewards = torch.exp(-((10.0 * error) ** 2))
-    for loop, entry in enumerate(tried):
-        margin = 4 * rewards[:, loop].std().item() / len(x) ** 0.5 + 1e-12
-        assert step.reward[loop, place, entry] == pytest.approx(rewards[:, loop].mean().item(), abs=margin)
-        ones = step.transition[loop][place, entry].sum()
-        assert ones == pytest.approx(1.0)  # the basis is a partition of one
+    step = one_step(case.process, case.task, beta, axes, Resolution(9, 5, 5))
+    x = torch.tensor([[axes[0][place // 9], axes[1][place % 9]]], dtype=torch.float64).expand(400_000, -1)
+    u = torch.tensor([[step.inputs[loop, entry] for loop, entry in enumerate(tried)]], dtype=torch.float64).expand(len(x), -1)
+    noise = torch.randn(len(x), case.process.n_disturbances, generator=stream(0, "step"), dtype=torch.float64)
+    after = case.process.step(x, u, noise)
+    rewards = tracking_reward((case.task.set_point - after) / case.task.error_scale, beta)
+    margin = 4 * rewards.std().item() / len(x) ** 0.5 + 2e-3 * rewards.mean().item()  # moments above the third
+    assert step.reward[place, *tried] == pytest.approx(rewards.mean().item(), abs=margin)
+    for power in (0, 1, 2):
+        values = np.add.outer(axes[0] ** power, 0.5 * axes[1] ** power)
+        expected = (after[:, 0] ** power + 0.5 * after[:, 1] ** power).mean().item()
+        assert expected_value(step, coefficients(axes, values))[place, *tried] == pytest.approx(expected, rel=2e-3, abs=1e-3)
 
 
-@pytest.mark.parametrize(("case_number", "beta"), [(1, 30.0), (2, 10.0)])
-def test_value_and_monte_carlo_agree_and_neither_lies_below_minimum_variance(study, case_number, beta):
+@pytest.mark.parametrize(("case_number", "beta", "share"), [(1, 30.0, 0.999), (3, 30.0, 1.01)])
+def test_value_and_monte_carlo_agree_and_neither_lies_below_minimum_variance(study, case_number, beta, share):
+    """In Case I looking ahead gains nothing, in Case III, where the inputs are slow, some per cent."""
     case = study(case_number, process={"observation_noise": (0.0, 0.0)})
     known = MinimumVariance(case.process.state_step, case.process.input_step, case.task.set_point)
     reference = rollout(case.process, known, case.task, 2000, stream(0, "test"))
@@ -55,8 +76,8 @@ def test_value_and_monte_carlo_agree_and_neither_lies_below_minimum_variance(stu
     least, found = (objective(batch, case.features.on("x"), beta).mean().item() for batch in (reference, greedy))
     value = optimum.value_at(greedy.x[0]).mean().item()
     assert value == pytest.approx(found, rel=0.01)  # of a coarser grid than at paper scale, and fewer draws
-    assert found > least
-    assert value > least * 0.995
+    assert found > share * least
+    assert value > share * 0.995 * least
 
 
 def test_a_last_step_without_noise_goes_to_the_set_point(study):
@@ -67,15 +88,17 @@ def test_a_last_step_without_noise_goes_to_the_set_point(study):
     x = torch.tensor([[axes[0][2], axes[1][4]]])
     known = MinimumVariance(case.process.state_step, case.process.input_step, case.task.set_point)
     found, _ = Tabulated(optimum).act(x, 0)
-    assert found.numpy() == pytest.approx(known.act(x, None)[0].numpy(), abs=0.02)
+    assert found.numpy() == pytest.approx(known.act(x, None)[0].numpy(), abs=0.05)  # they are 0.2 and 0.6 apart
     assert optimum.value_at(x).item() == pytest.approx(2.0, abs=1e-3)
 
 
-def test_coupled_inputs_are_refused(study):
-    case = study(1, process={"drift_input": ((0.5, 0.1), (0.0, 0.3))})
-    axes = (np.linspace(-1, 1, 5), np.linspace(-1, 1, 5))
-    with pytest.raises(ValueError, match="diagonal"):
-        dynamic_programme(case.process, case.task, 10.0, 0.99, axes, Resolution(5, 3, 3))
+def test_inputs_may_move_each_others_states(study):
+    """The value at inputs that are coupled is that of the same moves made by inputs that are not."""
+    case = study(1, process={"horizon": 1, "disturbance": (0.2, 0.2)})
+    coupled = study(1, process={"horizon": 1, "disturbance": (0.2, 0.2), "drift_input": ((0.5, 0.05), (0.1, 0.305))})
+    axes = (np.linspace(-1.2, -0.8, 7), np.linspace(3.5, 4.5, 7))
+    values = [dynamic_programme(each.process, each.task, 10.0, 1.0, axes, Resolution(7, 101, 5)).value for each in (case, coupled)]
+    np.testing.assert_allclose(values[0], values[1], rtol=2e-3)
 
 
 def test_the_stationary_policy_stays_that_of_the_first_sample(study):

@@ -78,26 +78,34 @@ def test_the_exact_drift_is_the_solution_of_the_undisturbed_equation():
     x, u = np.array([0.7, -1.3]), np.array([9.0, -31.0])
     solved = solve_ivp(lambda _, z: A @ z + B @ u, (0, process.sampling_time), x, rtol=1e-10, atol=1e-12).y[:, -1]
     step = LinearProcess(exact_drift(process), torch.float64)
-    found = step.step(torch.tensor(x)[None], torch.tensor(u)[None], torch.zeros(1, 2, dtype=torch.float64))[0]
+    found = step.step(torch.tensor(x)[None], torch.tensor(u)[None], torch.zeros(1, 8).double())[0]
     np.testing.assert_allclose(found.numpy(), solved, rtol=1e-8)
-    euler = x + (A @ x + B @ u) * process.sampling_time
-    assert np.abs(euler - solved).max() > 1e-3
+    euler = LinearProcess(process, torch.float64).step(torch.tensor(x)[None], torch.tensor(u)[None], torch.zeros(1, 8).double())[0]
+    assert np.abs(euler.numpy() - solved).max() > 1e-3
 
 
 def test_finer_steps_keep_the_mean_of_the_exact_drift_and_spread_as_an_integral():
     """One loop without coupling at rest: x' = a x + b u + d x w has a mean and a second moment in closed form over a sample."""
     a, b, d, dt, x0, u0 = -4.0, 0.5, 0.5, 0.04, 1.0, 20.0
-    update = {"drift_state": ((a, 0.0), (0.0, a)), "drift_input": ((b, 0.0), (0.0, b)), "disturbance": (d, d), "sampling_time": dt}
+    update = {
+        "drift_state": ((a, 0.0), (0.0, a)),
+        "drift_input": ((b, 0.0), (0.0, b)),
+        "disturbance": (d, d),
+        "sampling_time": dt,
+        "integration_steps": 16,
+    }
     generator = torch.Generator().manual_seed(0)
-    finer = ReadProcess(FIRST.process.model_copy(update=update), Reading(substeps=16), generator)
+    finer = ReadProcess(FIRST.process.model_copy(update=update), MAIN, generator)
     ones = torch.ones(200_000, 2, dtype=torch.float64)
-    x = finer.step(x0 * ones, u0 * ones, torch.randn(ones.shape, generator=generator, dtype=torch.float64))
+    x = finer.step(x0 * ones, u0 * ones, torch.randn(len(ones), finer.n_disturbances, generator=generator, dtype=torch.float64))
     moments = solve_ivp(
         lambda _, m: [a * m[0] + b * u0, (2 * a + d**2) * m[1] + 2 * b * u0 * m[0]], (0, dt), [x0, x0**2], rtol=1e-10, atol=1e-12
     ).y[:, -1]
     assert x.mean().item() == pytest.approx(moments[0], rel=2e-3)
     assert x.var().item() == pytest.approx(moments[1] - moments[0] ** 2, rel=2e-2)
-    assert simulate(FIRST, {}, Reading(substeps=3), 20, draws()).v.equal(simulate(FIRST, {}, Reading(substeps=3), 20, draws()).v)
+    reading = Reading(integration_steps=3)
+    assert with_settings(FIRST, {}, reading).process.integration_steps == 3
+    assert simulate(FIRST, {}, reading, 20, draws()).v.equal(simulate(FIRST, {}, reading, 20, draws()).v)
 
 
 def test_the_error_of_the_initial_state_takes_the_place_of_the_number():
@@ -114,7 +122,7 @@ def test_the_error_of_the_initial_state_takes_the_place_of_the_number():
 def one_loop_by_hand(n_steps, reading):
     """Commands of both loops of case 1 in plain floats, without noise."""
     process, gains, target = FIRST.process, FIRST.demonstrator, FIRST.case.set_point
-    A, B, dt = np.array(process.drift_state), np.array(process.drift_input), process.sampling_time
+    A, B, dt, m = np.array(process.drift_state), np.array(process.drift_input), process.sampling_time, process.integration_steps
     x, total, commands = np.zeros(2), np.zeros(2), []
     before = np.zeros(2) if reading.derivative_from_zero else None
     kp, ki, kd = (np.array(getattr(gains, kind)) for kind in GAINS)
@@ -132,7 +140,8 @@ def one_loop_by_hand(n_steps, reading):
         frozen = (u != command) & (np.sign(error) == np.sign(command)) & reading.conditional_integration
         total, before = np.where(frozen, total, tried), smooth
         commands.append(command)
-        x = x + (A @ x + B @ u) * dt
+        for _ in range(m):
+            x = x + (A @ x + B @ u) * dt / m
     return np.array(commands)
 
 
@@ -175,7 +184,7 @@ def test_the_pid_of_a_reading_without_noise(changes, monkeypatch):
     ],
 )
 def test_one_step_of_a_reading_by_hand(changes, expected):
-    process = FIRST.process
+    process = FIRST.process.model_copy(update={"integration_steps": 1})
     A, B, dt = np.array(process.drift_state), np.array(process.drift_input), process.sampling_time
     x, u, w = np.array([0.7, -1.3]), np.array([9.0, -31.0]), np.array([0.4, -1.7])
     found = ReadProcess(process, Reading(**changes), torch.Generator()).step(*(torch.tensor(v)[None] for v in (x, u, w)))[0]
@@ -185,11 +194,9 @@ def test_one_step_of_a_reading_by_hand(changes, expected):
 
 def test_the_disturbance_of_several_steps_comes_once_at_the_end_and_as_wide():
     generator = torch.Generator().manual_seed(0)
-    x, still = torch.ones(100_000, 2, dtype=torch.float64), torch.zeros(100_000, 2, dtype=torch.float64)
-    mean = ReadProcess(FIRST.process.model_copy(update={"disturbance": (0.0, 0.0)}), Reading(substeps=4), generator).step(
-        x, x, still
-    )
-    found = ReadProcess(FIRST.process, Reading(substeps=4, disturbance="once"), generator).step(x, x, still)
+    x, noise = torch.ones(100_000, 2).double(), torch.randn(100_000, 8, generator=generator, dtype=torch.float64)
+    mean = ReadProcess(FIRST.process, MAIN, generator).step(x, x, torch.zeros_like(noise))
+    found = ReadProcess(FIRST.process, Reading(disturbance="once"), generator).step(x, x, noise)
     expected = np.array(FIRST.process.disturbance) * FIRST.process.sampling_time**0.5
     np.testing.assert_allclose((found / mean - 1).std(0).numpy(), expected, rtol=2e-2)
 
@@ -200,7 +207,7 @@ def test_what_the_controller_sees_and_what_the_types_are_taken_of():
         name: ReadProcess(FIRST.process, Reading(**{name: True}), torch.Generator()) for name in ("acts_on_state", "observed_state")
     }
     assert all(process.observe(x, noise).equal(x) for process in seen.values())
-    after = [process.step(x, x, torch.zeros_like(x)) for process in seen.values()]
+    after = [process.step(x, x, torch.zeros(4, 8).double()) for process in seen.values()]
     assert (after[1] / after[0] - 1).abs().min() > 0
     of = {
         name: simulate(FIRST, {}, reading, 40, draws()).v

@@ -32,16 +32,19 @@ def test_two_steps_by_hand(study):
     memory = controller.start(1, 2, stream(0))
     for y in readings:
         _, memory = controller.act(torch.tensor(y)[None], memory)
-    A, B = case.process.state_step.numpy(), case.process.input_step.numpy()
+    process, m = case.params.process, case.params.process.integration_steps
+    tau = process.sampling_time / m
+    A, B = np.eye(2) + tau * np.array(process.drift_state), tau * np.array(process.drift_input)
     mean, P = case.task.initial_mean.numpy(), np.diag(case.task.initial_std.numpy() ** 2)
-    d, r = case.process.disturbance_gain.numpy() ** 2 * case.process.sampling_time, case.process.observation_noise.numpy() ** 2
+    d, r = np.array(process.disturbance) ** 2 * tau, np.array(process.observation_noise) ** 2
     for y, seen in zip(readings, spy.seen, strict=True):
         R = np.diag(r * (mean**2 + P.diagonal()))
         K = P @ np.linalg.inv(P + R)
         mean = mean + K @ (y - mean)
         P = (np.eye(2) - K) @ P @ (np.eye(2) - K).T + K @ R @ K.T
         assert seen[0].numpy() == pytest.approx(mean, rel=1e-9)
-        P, mean = A @ P @ A.T + np.diag(d * (mean**2 + P.diagonal())), A @ mean + B @ np.full(2, 5.0)
+        for _ in range(m):
+            P, mean = A @ P @ A.T + np.diag(d * (mean**2 + P.diagonal())), A @ mean + B @ np.full(2, 5.0)
     assert memory.mean[0].numpy() == pytest.approx(mean)
     assert memory.covariance[0].numpy() == pytest.approx(P)
 

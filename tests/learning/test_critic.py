@@ -19,12 +19,12 @@ def test_the_critic_finds_the_expected_reward_of_the_next_sample(study):
     batch = rollout(process, case.expert, case.task, 2000, torch.Generator().manual_seed(0))
     normal = partial(torch.randn, generator=torch.Generator().manual_seed(1), dtype=batch.u.dtype)
     u = batch.u + normal(batch.u.shape)
-    x = torch.stack([process.step(state, entry, normal(state.shape)) for state, entry in zip(batch.x[:-1], u, strict=True)])
+    x = torch.stack([process.step(state, entry, normal(len(state), 8)) for state, entry in zip(batch.x[:-1], u, strict=True)])
     critic = Critic(features)
     critic.learn(replace(batch, u=u, y=batch.x, x=torch.cat([batch.x[:1], x])))  # each step of its own, seen without noise
     state = case.task.set_point * torch.tensor([[1.0, 1.0], [0.95, 1.05]], dtype=u.dtype)
     entry = case.minimum_variance.act(state, None)[0] + torch.tensor([[0.0, 0.0], [0.1, 5.0]], dtype=u.dtype)
-    after = torch.stack([process.step(state, entry, normal(2, 2)) for _ in range(5000)])
+    after = torch.stack([process.step(state, entry, normal(2, 8)) for _ in range(5000)])
     truth = torch.exp(-((30.0 * (case.task.set_point - after) / case.task.error_scale) ** 2)).sum(-1).mean(0)
     assert torch.allclose(critic.value(state, entry, 30.0), truth, rtol=0.1)
 

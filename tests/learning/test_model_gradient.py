@@ -38,9 +38,10 @@ def fresh(case):
 
 def episodes(case, n, n_steps, set_point, load=0.0):
     generator = stream(0, "episodes")
-    start, w, v = (torch.randn(m, n, 2, generator=generator, dtype=case.dtype) for m in (1, n_steps, n_steps + 1))
+    shapes = (1, n, 2), (n_steps, n, case.process.n_disturbances), (n_steps + 1, n, 2)
+    start, w, v = (torch.randn(shape, generator=generator, dtype=case.dtype) for shape in shapes)
     target = torch.tensor(set_point, dtype=case.dtype).expand(n_steps, n, 2)
-    return Scenarios(case.process, target, torch.zeros_like(w) + load, 0.1 * start[0], 0 * start[0], w, v)
+    return Scenarios(case.process, target, torch.zeros_like(v[1:]) + load, 0.1 * start[0], 0 * start[0], w, v)
 
 
 def squared(scenarios, run):
@@ -128,6 +129,8 @@ def test_the_gradient_through_the_nonlinear_tank_is_that_of_finite_differences()
 
 def test_a_process_that_torch_cannot_differentiate_is_refused_in_one_sentence(case):
     class ByNumpy:
+        n_disturbances = 2
+
         def step(self, x, u, noise):
             return torch.from_numpy(x.numpy() + u.numpy())
 

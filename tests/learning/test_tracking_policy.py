@@ -58,7 +58,9 @@ def episodes(case, set_point, load=0.0, n=3):
     generator = stream(0, "episodes")
     zero = torch.zeros(n_steps + 1, n, 2, dtype=case.dtype)
     start = 0.3 * torch.randn(n, 2, generator=generator, dtype=case.dtype)
-    return Scenarios(case.process, set_point[:, None].expand(-1, n, -1), zero[1:] + load, start, zero[0], zero[1:], zero)
+    return Scenarios(
+        case.process, set_point[:, None].expand(-1, n, -1), zero[1:] + load, start, zero[0], zero[1:].repeat(1, 1, 4), zero
+    )
 
 
 def test_with_an_output_layer_of_zero_it_is_the_pid(study):
@@ -66,7 +68,7 @@ def test_with_an_output_layer_of_zero_it_is_the_pid(study):
     policy = fresh(case)
     drawn = episodes(case, case.task.set_point.expand(40, 2))
     noise = torch.randn(41, 3, 2, generator=stream(1, "noise"), dtype=case.dtype)
-    drawn = replace(drawn, noise=noise, disturbance=noise[1:])
+    drawn = replace(drawn, noise=noise, disturbance=noise[1:].repeat(1, 1, 4))
     found, expected = (track(tracker, drawn, bounds(case)) for tracker in (policy, tracking_pid(case)))
     torch.testing.assert_close(found.u, expected.u, rtol=1e-10, atol=1e-10)
     for found_part, part in zip(vars(policy.gains).values(), vars(gains()).values(), strict=True):

@@ -33,7 +33,7 @@ class Hold:
 
 
 class Own:
-    n_states, n_outputs, n_inputs = 2, 1, 2
+    n_states, n_outputs, n_inputs, n_disturbances = 2, 1, 2, 2
 
     def __init__(self, description):
         self.title = description.title

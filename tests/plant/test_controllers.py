@@ -64,7 +64,7 @@ def test_minimum_variance_expects_the_next_state_at_the_set_point(study):
     controller = MinimumVariance(case.process.state_step, case.process.input_step, case.task.set_point)
     x = torch.tensor([[0.0, 0.0], [0.9, 4.2], [3.0, -7.0]], dtype=torch.float64)
     command, _ = controller.act(x, controller.start(3, 1, stream(0)))
-    reached = case.process.step(x, command, torch.zeros_like(x))
+    reached = case.process.step(x, command, torch.zeros(3, case.process.n_disturbances, dtype=x.dtype))
     torch.testing.assert_close(reached, case.task.set_point.expand_as(x), rtol=1e-10, atol=1e-10)
 
 
@@ -101,7 +101,7 @@ def test_predictive_law_rests_at_the_set_point(study):
     controller = SaturatedLQ(case.process.state_step, case.process.input_step, case.task, 10, 0.1)
     at_rest = controller.input_at_rest[None]
     x = case.task.set_point[None]
-    torch.testing.assert_close(case.process.step(x, at_rest, torch.zeros_like(x)), x)
+    torch.testing.assert_close(case.process.step(x, at_rest, torch.zeros(len(x), case.process.n_disturbances, dtype=x.dtype)), x)
     torch.testing.assert_close(controller.act(x, at_rest)[0], at_rest)
     start = controller.start(3, 5, stream(0))
     assert torch.equal(start, torch.zeros(3, 2, dtype=x.dtype))

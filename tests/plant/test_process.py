@@ -22,17 +22,25 @@ def repeat(row, n):
 
 def end_without_noise(study, dt, horizon=2.0):
     """The state at `horizon` of the noise-free process, integrated with steps of `dt`."""
-    process = study(process={"sampling_time": dt}).process
+    process = study(process={"sampling_time": dt, "integration_steps": 1}).process
     x, u = repeat(X0, 1), repeat(U0, 1)
     for _ in range(round(horizon / dt)):
         x = process.step(x, u, torch.zeros_like(x))
     return x[0].numpy()
 
 
+def by_hand(x, u, noise, dt, m):
+    """Euler-Maruyama, Eq. 4.1.3a: m steps from states (K, 2) with the input held and noise (K, m, 2)."""
+    tau = dt / m
+    for step in range(m):
+        x = x + (x @ A.T + u @ B.T) * tau + D * x * tau**0.5 * noise[:, step]
+    return x
+
+
 @pytest.mark.equation("4.1.3")
 @pytest.mark.parametrize("dt", [0.04, 0.36])
 def test_mean_and_covariance_of_one_step(study, dt):
-    process, n = study(process={"sampling_time": dt}).process, 200_000
+    process, n = study(process={"sampling_time": dt, "integration_steps": 1}).process, 200_000
     after = process.step(repeat(X0, n), repeat(U0, n), torch.randn(n, 2, generator=stream(0, "step"), dtype=F64)).numpy()
     mean, variance = X0 + (A @ X0 + B @ U0) * dt, (D * X0) ** 2 * dt
     error = after - mean
@@ -41,9 +49,45 @@ def test_mean_and_covariance_of_one_step(study, dt):
     assert abs(np.corrcoef(error.T)[0, 1]) < 5 / np.sqrt(n)  # the Wiener processes of the loops are independent
 
 
+@pytest.mark.equation("4.1.3a")
+@pytest.mark.parametrize("m", [1, 4])
+def test_a_sample_is_so_many_steps(study, m):
+    """Against numpy; and mean and covariance over many draws, from a spread-out state."""
+    process, n = study(process={"integration_steps": m}).process, 200_000
+    noise = torch.randn(n, process.n_disturbances, generator=stream(0, "steps"), dtype=F64)
+    start = torch.tensor(X0) + torch.randn(n, 2, generator=stream(0, "start"), dtype=F64) * torch.tensor([0.1, 0.2])
+    found = process.step(start, repeat(U0, n), noise)
+    torch.testing.assert_close(found, torch.tensor(by_hand(start.numpy(), U0[None], noise.numpy().reshape(n, m, 2), 0.04, m)))
+    still = process.step(repeat(X0, 1), repeat(U0, 1), torch.zeros(1, 2 * m, dtype=F64))
+    expected = process.state_step @ torch.tensor(X0) + process.input_step @ torch.tensor(U0)
+    torch.testing.assert_close(still[0], expected, rtol=1e-12, atol=1e-12)
+    mean, covariance = process.moments(torch.tensor(X0), torch.tensor([0.01, 0.04], dtype=F64).diag(), torch.tensor(U0))
+    error = found.std(0) / n**0.5
+    assert ((found.mean(0) - mean).abs() < 5 * error).all()
+    torch.testing.assert_close(torch.cov(found.T), covariance, rtol=0.02, atol=2e-4)
+    torch.testing.assert_close(mean, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_noise_for_another_number_of_steps_is_refused(study):
+    with pytest.raises(ValueError, match="noise of 2 columns, expected 8"):
+        study().process.step(repeat(X0, 1), repeat(U0, 1), repeat(X0, 1))
+
+
+def test_before_its_last_kick_the_next_state_is_normal(study):
+    """Whatever moves the last part of the noise alone moves the state by so many of its standard deviations."""
+    process = study().process
+    x, u = (torch.randn(5, 3, 2, generator=stream(0, name), dtype=F64) for name in ("x", "u"))
+    noise = torch.randn(5, 3, 8, generator=stream(0, "w"), dtype=F64)
+    for given in (process, process.scaled(*torch.tensor([[0.7, 1.0, 1.3], [1.2, 1.0, 0.8]], dtype=F64))):
+        mean, std = given.before_last_kick(x, u, noise)
+        after = given.step(x, u, noise)
+        torch.testing.assert_close(((after - mean) / std).abs(), noise[..., 6:].abs())
+
+
 def test_factors_of_each_trajectory_are_processes_of_their_own(study):
     generator = stream(0, "factors")
-    x, u, noise, factors = (torch.randn(3, 2, generator=generator, dtype=F64) for _ in range(4))
+    x, u, factors = (torch.randn(3, 2, generator=generator, dtype=F64) for _ in range(3))
+    noise = torch.randn(3, 8, generator=generator, dtype=F64)
     state, entry = 1 + 0.3 * factors.T
     process = study().process
     found = process.scaled(state, entry)
@@ -69,7 +113,7 @@ def test_without_noise_the_step_converges_to_first_order(study):
 
 @pytest.mark.equation("4.1.3c")
 def test_the_disturbance_vanishes_at_the_steady_state_and_is_proportional_elsewhere(study):
-    process, noise = study().process, torch.full((1, 2), 3.0, dtype=F64)
+    process, noise = study().process, torch.full((1, 8), 3.0, dtype=F64)
     rest = torch.zeros(1, 2, dtype=F64)
     assert torch.equal(process.step(rest, rest, noise), rest)
     np.testing.assert_allclose(process.disturbance(repeat(X0, 1))[0], np.diag(D) @ X0, rtol=1e-14)
@@ -77,7 +121,7 @@ def test_the_disturbance_vanishes_at_the_steady_state_and_is_proportional_elsewh
 
 @pytest.mark.equation("4.1.3b")
 def test_drift_is_linear_in_state_and_input(study):
-    process = study().process
+    process = study(process={"integration_steps": 1}).process
     np.testing.assert_allclose(process.drift(repeat(X0, 1), repeat(U0, 1))[0], A @ X0 + B @ U0, rtol=1e-12)
     x, u = repeat(X0, 3), repeat(U0, 3)
     still = process.step(x, u, torch.zeros_like(x))
@@ -137,5 +181,5 @@ def test_sizes_and_number_type_follow_the_parameters(study, dtype):
     process = LinearProcess(study().params.process, dtype)
     assert (process.n_states, process.n_outputs, process.n_inputs) == (2, 2, 2)
     x = torch.ones(4, 2, dtype=dtype)
-    assert process.step(x, x, x).dtype == dtype
+    assert process.step(x, x, torch.ones(4, 8, dtype=dtype)).dtype == dtype
     assert process.observe(x, x).dtype == dtype

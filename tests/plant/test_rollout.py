@@ -24,12 +24,12 @@ class Constant:
 
 
 class Echo:
-    """A process whose states and observations are the noise that it is handed."""
+    """A process whose states and observations are the noise that it is handed; as much of it as the stirred tank takes."""
 
-    n_states, n_outputs, n_inputs = 2, 2, 2
+    n_states, n_outputs, n_inputs, n_disturbances = 2, 2, 2, 8
 
     def step(self, x, u, noise):
-        return noise
+        return noise[:, 6:]
 
     def observe(self, x, noise):
         return noise
@@ -96,7 +96,7 @@ def test_without_noise_an_episode_is_a_plain_loop(study):
     )
     found = rollout(case.process, case.pid, case.task, 2, stream(0, "plain"))
     params, gains = case.params.process, case.params.demonstrator
-    a, b, dt = np.array(params.drift_state), np.array(params.drift_input), params.sampling_time
+    a, b, dt, m = np.array(params.drift_state), np.array(params.drift_input), params.sampling_time, params.integration_steps
     kp, ki, kd = (np.array(gain) for gain in (gains.proportional, gains.integral, gains.derivative))
     x, total, before = np.array([0.3, -0.4]), np.zeros(2), None
     for t in range(50):
@@ -108,7 +108,8 @@ def test_without_noise_an_episode_is_a_plain_loop(study):
         u = np.clip(command, params.input_low, params.input_high)
         np.testing.assert_allclose(found.command[t, 1], command, rtol=0, atol=1e-8)
         np.testing.assert_allclose(found.u[t, 1], u, rtol=0, atol=1e-8)
-        x = x + (a @ x + b @ u) * dt
+        for _ in range(m):
+            x = x + (a @ x + b @ u) * dt / m
     np.testing.assert_allclose(found.x[50, 1], x, rtol=0, atol=1e-11)
     assert torch.equal(found.x, found.y)
 

@@ -40,7 +40,9 @@ def pid(case):
 def scenarios(case):
     """The draws that `rollout` makes from the same stream."""
     generator = stream(0, "episodes")
-    start, disturbance, noise = (torch.randn(n, 2, N, generator=generator, dtype=case.dtype).mT for n in (1, T, T + 1))
+    start, disturbance, noise = (
+        torch.randn(n, width, N, generator=generator, dtype=case.dtype).mT for n, width in ((1, 2), (T, 8), (T + 1, 2))
+    )
     zero = torch.zeros(T, N, 2, dtype=case.dtype)
     first = case.task.initial_mean + case.task.initial_std * start[0]
     return Scenarios(case.process, case.task.set_point.expand(T, N, 2), zero, first, zero[0], disturbance, noise)

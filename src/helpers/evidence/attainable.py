@@ -1,7 +1,8 @@
 """What is attainable: an estimate of the optimum of the tracking objective by dynamic programming, knowing process and state.
 
-The process x_(t+1) = A x_t + B u_t + diag(s) x_t w_t with diagonal B makes it tractable: each input moves the mean of one state
-alone, and the noise of the states is independent, so that one-step expectations are products over the states.
+The next state is taken for what its first moments say, and its entries for independent, so that one-step expectations are products
+over the states. Those of the value are computed on a lattice of *moves* v = B u, each of which shifts the mean of one state alone,
+and read off by splines at the inputs that are tried. What this leaves out shows between value and Monte Carlo.
 """
 
 from collections.abc import Sequence
@@ -19,15 +20,19 @@ from helpers.plant.task import ControlTask
 
 Array = NDArray[np.float64]
 DEGREE = 3  # of the splines between the grid points
+BLOCK = 500  # grid points at once, which bounds the memory
 
 
-def expected_closeness(mean_error: Array, error_std: Array, beta: float) -> Array:
-    """E exp(-(beta e)^2) for a normal e: the Type I feature of Eq. 4.2.2, expected one step ahead.
+def expected_closeness(mean_error: Array, error_std: Array, beta: float, third: Array | float = 0.0) -> Array:
+    """E exp(-(beta e)^2) for an error e with this mean, standard deviation and third central moment: Eq. 4.2.2, one step ahead.
 
-    (1 + 2 beta^2 s^2)^(-1/2) exp(-beta^2 m^2 / (1 + 2 beta^2 s^2)), m and s being mean and standard deviation of e.
+    Of a normal e it is G = (1 + 2 beta^2 s^2)^(-1/2) exp(-a m^2), a = beta^2 / (1 + 2 beta^2 s^2). The third moment k adds
+    k / 6 times the third derivative of G in m (Gram-Charlier series of type A).
     """
     spread = 1 + 2 * (beta * error_std) ** 2
-    return np.exp(-((beta * mean_error) ** 2) / spread) / np.sqrt(spread)
+    a = beta**2 / spread
+    skewed = 1 + third / 6 * (12 * a**2 * mean_error - 8 * a**3 * mean_error**3)
+    return np.exp(-a * mean_error**2) / np.sqrt(spread) * skewed
 
 
 @dataclass(frozen=True)
@@ -55,14 +60,14 @@ class Optimum:
 
     def value_at(self, x: Tensor) -> Tensor:
         """The expected objective from initial states (K, n_x), shape (K,); states off the grid count as its edge."""
-        result = _coefficients(self.axes, self.value)[None]
+        result = coefficients(self.axes, self.value)[None]
         for points, state in zip(self.axes, x.double().numpy().T, strict=True):
             rows = _basis(points, state).toarray()
             result = np.einsum("ka...,ka->k...", np.broadcast_to(result, (len(rows), *result.shape[1:])), rows)
         return torch.from_numpy(result)
 
 
-def _coefficients(axes: Sequence[Array], values: Array) -> Array:
+def coefficients(axes: Sequence[Array], values: Array) -> Array:
     """The coefficients of the spline through values on the grid, of their shape."""
     for axis, points in enumerate(axes):
         values = np.moveaxis(make_interp_spline(points, np.moveaxis(values, axis, 0), DEGREE).c, 0, axis)
@@ -90,49 +95,77 @@ class OneStep:
 
     Attributes:
         inputs: the lattice of each input, shape (n_u, n).
-        reward: expected reward of each loop, shape (n_x, G, n).
-        transition: for each state the expected spline basis at the next sample, shape (G, n, N).
+        reward: expected reward of all loops, shape (G, n, ..., n).
+        transition: for each state the expected spline basis at the next sample, as coefficients of a spline over n moves of its
+            mean, shape (G, n, N).
+        moves: the basis of these splines at the moves of every combination of inputs, shape (n^n_u, n^n_x).
     """
 
     inputs: Array
     reward: Array
     transition: tuple[Array, ...]
+    moves: csr_array
 
 
 def one_step(process: LinearProcess, task: ControlTask, beta: float, axes: Sequence[Array], resolution: Resolution) -> OneStep:
     """Rewards and transitions one sample ahead from every grid point.
 
-    The reward is in closed form, because beta = 30 is too narrow for a few nodes. The value of the next state is smoother; the
-    expectation of its splines is taken by a Gauss-Hermite rule.
-
-    Raises:
-        ValueError: if an input moves the mean of more than one state.
+    The reward is in closed form, because beta = 30 is too narrow for a few nodes. The value of the next state is smoother: there a
+    Gauss-Hermite rule does, for a normal of its mean and variance.
     """
     A, B = process.state_step.double().numpy(), process.input_step.double().numpy()
-    if B.shape[0] != B.shape[1] or np.count_nonzero(B - np.diag(B.diagonal())):
-        raise ValueError("the dynamic programme needs inputs that each move one state alone: B must be diagonal")
     states = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
     low, high = task.input_low.double().numpy(), task.input_high.double().numpy()
     inputs = np.linspace(low, high, resolution.inputs, axis=-1)
-    mean = (states @ A.T).T[..., None] + B.diagonal()[:, None, None] * inputs[:, None]
-    std = (process.disturbance_gain.double().numpy() * process.sampling_time**0.5 * np.abs(states)).T
+    tried = np.stack(np.meshgrid(*inputs, indexing="ij"), axis=-1)  # (n, ..., n, n_u)
     scale, target = task.error_scale.double().numpy(), task.set_point.double().numpy()
-    reward = expected_closeness(
-        (target[:, None, None] - mean) / scale[:, None, None], (std / np.abs(scale)[:, None])[..., None], beta
-    )
+    reward = []
+    for block in np.array_split(states, -(-len(states) // BLOCK)):
+        mean, std, third = _moments(process, block[(slice(None), *[None] * len(inputs))], tried)
+        error, skew = (target - mean) / scale, -third / scale**3
+        reward.append(expected_closeness(error, std / np.abs(scale), beta, skew).sum(-1))
+    asked = tried @ B.T
+    flat = asked.reshape(-1, asked.shape[-1])
+    lattice = np.linspace(flat.min(0), flat.max(0), resolution.inputs, axis=-1)
     nodes, weights = np.polynomial.hermite_e.hermegauss(resolution.nodes)
     weights /= weights.sum()
-    transition = []
-    for points, m, s in zip(axes, mean, std, strict=True):
-        expected = np.zeros((m.size, len(points)))
+    middle, transition = (low + high) / 2, []
+    for loop, (points, moves) in enumerate(zip(axes, lattice, strict=True)):
+        # The input that makes a move; how it moves the other states hardly counts for the spread of this one.
+        making = middle + np.outer(moves - (B @ middle)[loop], np.linalg.inv(B)[:, loop])
+        _, spread, _ = _moments(process, states[:, None], making)
+        expected = np.zeros((len(states) * len(moves), len(points)))
         for node, weight in zip(nodes, weights, strict=True):
-            expected += weight * _basis(points, m + node * s[:, None]).toarray()
-        transition.append(expected.reshape(*m.shape, len(points)))
-    return OneStep(inputs, reward, tuple(transition))
+            at = (states @ A.T)[:, [loop]] + moves + node * spread[..., loop]
+            expected += weight * _basis(points, at).toarray()
+        over_moves = np.moveaxis(expected.reshape(len(states), len(moves), len(points)), 1, 0)
+        transition.append(np.moveaxis(make_interp_spline(moves, over_moves, DEGREE).c, 0, 1))
+    combined = np.ones((len(flat), 1))
+    for moves, column in zip(lattice, flat.T, strict=True):
+        combined = (combined[:, :, None] * _basis(moves, column).toarray()[:, None]).reshape(len(flat), -1)
+    return OneStep(inputs, np.concatenate(reward), tuple(transition), csr_array(combined))
 
 
-def _expected_value(step: OneStep, spline: Array) -> Array:
-    """E of the next value for every grid point and pair of inputs, shape (G, n, ..., n), from spline coefficients."""
+def _moments(process: LinearProcess, x: Array, u: Array) -> tuple[Array, Array, Array]:
+    """Mean, standard deviation and third central moment of the next state, (..., n_x), from states and inputs that broadcast.
+
+    The third is that which each state would have by itself: what reaches it by way of the others is left out.
+    """
+    shape = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+    mean, entry = (torch.from_numpy(np.broadcast_to(part, (*shape, part.shape[-1])).copy()) for part in (x, u))
+    covariance, third = torch.zeros_like(mean).diag_embed(), torch.zeros_like(mean)
+    tau = process.sampling_time / process.integration_steps
+    kept, kick = 1 + tau * process.drift_state.diagonal(), tau * process.disturbance_gain**2
+    for _ in range(process.integration_steps):
+        # Of a x + c + s x w with w ~ N(0, 1): E[(x - m) x^2] is the third moment plus twice mean times variance.
+        twice = 2 * mean * covariance.diagonal(dim1=-2, dim2=-1)
+        third = kept**3 * third + 3 * kept * kick * (third + twice)
+        mean, covariance = process.moments(mean, covariance, entry, steps=1)
+    return mean.numpy(), covariance.diagonal(dim1=-2, dim2=-1).sqrt().numpy(), third.numpy()
+
+
+def expected_value(step: OneStep, spline: Array) -> Array:
+    """E of the next value for every grid point and combination of inputs, shape (G, n, ..., n), from spline coefficients."""
     first, *others = step.transition
     n_grid, n_inputs, n_points = first.shape
     value = (first.reshape(-1, n_points) @ spline.reshape(n_points, -1)).reshape(n_grid, n_inputs, *spline.shape[1:])
@@ -140,7 +173,7 @@ def _expected_value(step: OneStep, spline: Array) -> Array:
         value = np.moveaxis(value, 2, -1)  # the first axis that is still one of the next state
         before = value.shape[1:-1]
         value = (value.reshape(n_grid, -1, matrix.shape[-1]) @ matrix.mT).reshape(n_grid, *before, n_inputs)
-    return value
+    return (step.moves @ value.reshape(n_grid, -1).T).T.reshape(n_grid, *[n_inputs] * len(step.inputs))
 
 
 def _best(gain: Array, lattice: Array) -> tuple[Array, Array]:
@@ -180,18 +213,12 @@ def dynamic_programme(
 
     V_t(x) = max over u of E[R_(t+1) + gamma V_(t+1)(x_(t+1))], V_T = 0 (Bertsekas 2017, Section 1.3). Between the grid points V is
     a cubic spline. It is an estimate of the optimum, not a bound: grid, lattice and nodes all err a little to either side.
-
-    Raises:
-        ValueError: if an input moves the mean of more than one state.
     """
     step = one_step(process, task, beta, axes, resolution)
     shape = tuple(len(points) for points in axes)
-    reward: Array = np.zeros(())
-    for axis, of_loop in enumerate(step.reward):
-        reward = reward + of_loop.reshape(len(of_loop), *(-1 if other == axis else 1 for other in range(len(shape))))
     value, tables = np.zeros(shape), []
     for _ in range(task.n_steps):
-        best, inputs = _best(reward + discount * _expected_value(step, _coefficients(axes, value)), step.inputs)
+        best, inputs = _best(step.reward + discount * expected_value(step, coefficients(axes, value)), step.inputs)
         value = best.reshape(shape)
         tables.append(inputs.reshape(*shape, -1))
     return Optimum(axes, np.stack(tables[::-1]), value)

@@ -106,17 +106,25 @@ class Visitor:
 
 
 def reinforced(
-    contest: Contest, start: LSTMPolicy, purpose: str, dense: bool = False, early_reward: Reward | None = None
+    contest: Contest,
+    start: LSTMPolicy,
+    purpose: str,
+    from_scratch: bool = False,
+    alone: bool = False,
+    early_reward: Reward | None = None,
 ) -> Learned:
     """Algorithm 1 on the real objective with the online settings of learning.yaml, from a given policy.
 
     Args:
-        dense: it begins with the smaller beta of `dense`. early_reward: what it begins with instead.
+        from_scratch: it explores further, and begins with the smaller beta of `dense`. alone: REINFORCE without a critic, which
+            has to explore as far. early_reward: what it begins with instead.
     """
     session, visitor = contest.session, Visitor(contest)
     policy, n_epochs = copied(start), -(-contest.scale.episodes // contest.batch)
-    learner = session.online_learner(policy, contest.batch, n_epochs, session.stream("limits", purpose))
-    usual = learner.params
+    learner = session.online_learner(
+        policy, contest.batch, n_epochs, session.stream("limits", purpose), from_scratch=from_scratch or alone
+    )
+    usual = learner.params.model_copy(update={"critic": 0.0}) if alone else learner.params
     gentle = usual.model_copy(update={"learning_rate_start": usual.learning_rate_end})  # where a policy begins at its optimum
 
     def train() -> State:
@@ -127,7 +135,7 @@ def reinforced(
                 algorithm_1(learner, early_reward, 1)
             else:
                 learner.params = usual
-                algorithm_1(learner, learner.tracking(contest.sharpness(learner.episodes, dense)), 1)
+                algorithm_1(learner, learner.tracking(contest.sharpness(learner.episodes, from_scratch)), 1)
             if visitor.due(learner.episodes):
                 visitor(learner.episodes, learner.average)
         return {"policy": learner.average.state_dict(), "curve": visitor.curve}
@@ -269,9 +277,10 @@ def learn_all(contest: Contest) -> dict[str, Learned]:
     clone, tuning = contest.clone, contest.limits.tuning
     learned = {
         "irl_reinforce": reinforced(contest, contest.imitator, "hot"),
+        "irl_alone": reinforced(contest, contest.imitator, "alone", alone=True),
         "clone_reinforce": reinforced(contest, clone, "cloned"),
         "csil_reinforce": reinforced(contest, clone, "coherent", early_reward=coherent_reward(contest, clone)),
-        "scratch_reinforce": reinforced(contest, contest.session.fresh_policy(), "scratch", dense=True),
+        "scratch_reinforce": reinforced(contest, contest.session.fresh_policy(), "scratch", from_scratch=True),
         "pid_tuned": searched(contest, "tuning", 0, (1.0,)),
         "pid_scheduled": searched(contest, "scheduling", tuning.cells, contest.limits.robustness.set_point_factors),
         "mpc": predictive(contest),

@@ -154,14 +154,16 @@ def first_epoch(curve: pd.Series, level: float) -> float:
     return float(next(iter(curve.index[curve >= level]), curve.index[-1] + 1))
 
 
-def attempt(session: Session, start: LSTMPolicy, betas: Sequence[float]) -> tuple[LSTMPolicy, pd.DataFrame]:
+def attempt(
+    session: Session, start: LSTMPolicy, betas: Sequence[float], from_scratch: bool = False
+) -> tuple[LSTMPolicy, pd.DataFrame]:
     """Online learning with these betas, one a round: the policy and its curve.
 
     Where the reward is so sparse that every episode of a batch earns the same, learning cannot go on: the policy stays as it
     was at the start, and the curve is empty.
     """
     try:
-        result = session.varied(online={"beta": tuple(betas)}).improve(copied(start), "x")
+        result = session.varied(online={"beta": tuple(betas)}).improve(copied(start), "x", from_scratch=from_scratch)
     except TrainingError:
         return start, pd.DataFrame({"epochs": [], "episodes": [], "mean_return": []})
     return result.policy, history_table(result.records, session.feature_names)
@@ -177,10 +179,10 @@ def from_imitator(prepared: Prepared, betas: Sequence[float]) -> tuple[LSTMPolic
 def online_starts(prepared: Prepared) -> tuple[Scores, pd.DataFrame]:
     """Online learning from the imitating policy (hot) and from an untrained one (scratch), judged alike, and the curves.
 
-    Same epochs, rate, disturbances and beta. scratch_dense begins with the smaller beta of the offline features, which gives
-    learning from scratch a reward it can find, and has the headline beta in the later rounds only; <start>_beta_<beta>, where it is
-    planned, has another beta throughout. learned: 1 where learning could go on. epochs_to_level: when the return first reaches
-    what learning from scratch (the better of scratch and scratch_dense) ends with.
+    Same epochs, rate, disturbances and beta; who has learned nothing explores further. scratch_dense begins with the smaller beta
+    of the offline features, which gives learning from scratch a reward it can find, and has the headline beta in the later rounds
+    only; <start>_beta_<beta>, where it is planned, has another beta throughout. learned: 1 where learning could go on.
+    epochs_to_level: when the return first reaches what learning from scratch (the better of scratch and scratch_dense) ends with.
     """
     session, params = prepared.session, prepared.params
     rounds = session.params.case.online.epochs
@@ -191,7 +193,9 @@ def online_starts(prepared: Prepared) -> tuple[Scores, pd.DataFrame]:
     if prepared.planned(params.sparse_reward):
         betas |= {f"scratch_beta_{beta:g}": [beta] * len(rounds) for beta in params.sparse_reward.betas}
     results = {
-        name: from_imitator(prepared, of) if name.startswith("hot") else attempt(session, session.fresh_policy(), of)
+        name: from_imitator(prepared, of)
+        if name.startswith("hot")
+        else attempt(session, session.fresh_policy(), of, from_scratch=True)
         for name, of in betas.items()
     }
     budget = float(sum(session.epochs(n_epochs) for n_epochs in rounds))

@@ -30,7 +30,7 @@ def _explore(contest: Contest, run: str, start: LSTMPolicy, betas: tuple[float, 
     session = contest.session
     generator = session.stream("limits", "safety")
     epochs = [session.epochs(n_epochs) for n_epochs in session.params.case.online.epochs]
-    learner = session.online_learner(copied(start), contest.batch, sum(epochs), generator)
+    learner = session.online_learner(copied(start), contest.batch, sum(epochs), generator, from_scratch=run == "scratch")
     frames = []
     for n_epochs, beta in zip(epochs, betas, strict=True):
         reward = learner.tracking(beta)

@@ -27,8 +27,9 @@ class TrackingEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def __init__(self, process: LinearProcess, task: ControlTask, policy: PolicyParams, beta: float) -> None:
         self.beta = beta
         self.n_steps = task.n_steps
-        self.state_step, self.input_step = process.state_step.double().numpy(), process.input_step.double().numpy()
-        self.disturbance_step = process.disturbance_gain.double().numpy() * process.sampling_time**0.5
+        self.drift_state, self.drift_input = process.drift_state.double().numpy(), process.drift_input.double().numpy()
+        self.n_integration, self.h = process.integration_steps, process.sampling_time / process.integration_steps
+        self.disturbance_gain = process.disturbance_gain.double().numpy()
         self.observation_noise = process.observation_noise.double().numpy()
         self.set_point, self.error_scale = task.set_point.double().numpy(), task.error_scale.double().numpy()
         self.initial_mean, self.initial_std = task.initial_mean.double().numpy(), task.initial_std.double().numpy()
@@ -59,8 +60,10 @@ class TrackingEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def advance(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """One sample of the whole batch: what is seen, and the rewards of shape batch, from actions (*batch, n_u)."""
         self.u = self.middle + self.half * np.clip(action, -1.0, 1.0)
-        noise = self.np_random.standard_normal(self.x.shape)
-        self.x = self.x @ self.state_step.T + self.u @ self.input_step.T + self.disturbance_step * self.x * noise
+        pushed = self.u @ self.drift_input.T
+        for w in self.np_random.standard_normal((self.n_integration, *self.x.shape)):
+            drift = self.x @ self.drift_state.T + pushed
+            self.x = self.x + drift * self.h + self.disturbance_gain * self.x * self.h**0.5 * w
         self.t += 1
         return self._seen(), np.exp(-((self.beta * (self.set_point - self.x) / self.error_scale) ** 2)).sum(-1)
 

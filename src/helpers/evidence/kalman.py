@@ -35,8 +35,7 @@ class Filtered:
     def __init__(self, controller: Controller, process: LinearProcess, task: ControlTask) -> None:
         self.controller = controller
         self.task = task
-        self.state_step, self.input_step = process.state_step, process.input_step
-        self.process_variance = process.disturbance_gain**2 * process.sampling_time
+        self.process = process
         self.observation_variance = process.observation_noise**2
 
     def start(self, n_trajectories: int, n_steps: int, generator: torch.Generator) -> FilterMemory:
@@ -50,19 +49,12 @@ class Filtered:
         mean, covariance = self._corrected(observation, memory.mean, memory.covariance)
         command, inner = self.controller.act(mean, memory.inner)
         u = command.clamp(self.task.input_low, self.task.input_high)
-        spread = self.process_variance * _second_moment(mean, covariance)
-        predicted = self.state_step @ covariance @ self.state_step.T + spread.diag_embed()
-        return command, FilterMemory(mean @ self.state_step.T + u @ self.input_step.T, predicted, inner)
+        return command, FilterMemory(*self.process.moments(mean, covariance, u), inner)
 
     def _corrected(self, observation: Tensor, mean: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
-        noise = self.observation_variance * _second_moment(mean, covariance)
+        noise = self.observation_variance * (mean**2 + covariance.diagonal(dim1=-2, dim2=-1))  # of the expected square
         tiny = torch.finfo(mean.dtype).tiny  # a state known to be nought is observed without noise
         innovation = covariance + (noise + tiny).diag_embed()
         gain = torch.linalg.solve(innovation, covariance).mT  # both are symmetric
         corrected = mean + (gain @ (observation - mean)[..., None])[..., 0]
         return corrected, covariance - gain @ covariance
-
-
-def _second_moment(mean: Tensor, covariance: Tensor) -> Tensor:
-    """E x_i^2 of each state, shape (K, n_x)."""
-    return mean**2 + covariance.diagonal(dim1=-2, dim2=-1)

@@ -42,9 +42,9 @@ def without_noise(session: Study) -> Study:
 def attain(contest: Contest, beta: float) -> tuple[Optimum, pd.DataFrame]:
     """The dynamic programme for one beta, on finer and finer grids until value and Monte Carlo agree, and what each grid gave.
 
-    It stops where the value, averaged over initial states, and the Monte Carlo value of the greedy policy from the same states
-    agree within the tolerance, neither lies below one-step minimum variance on x, and the grid before gave the same within the
-    tolerance. agrees: whether that was reached.
+    It stops where, within the tolerance, the value averaged over initial states and the Monte Carlo value of the greedy policy from
+    the same states agree, neither lies below one-step minimum variance on x, and the grid before gave the same. agrees: whether
+    that was reached.
     """
     params, scale, session = contest.limits.attainable, contest.scale, without_noise(contest.session)
     features = session.features.on("x")
@@ -60,7 +60,9 @@ def attain(contest: Contest, beta: float) -> tuple[Optimum, pd.DataFrame]:
         value, found = optimum.value_at(greedy.x[0]).mean().item(), returns.mean().item()
         gap = value / found - 1
         change = found / rows[-1]["monte_carlo"] - 1 if rows else np.nan
-        agrees = abs(gap) <= params.tolerance and min(value, found) >= least and abs(change) <= params.tolerance
+        agrees = (
+            abs(gap) <= params.tolerance and min(value, found) >= least * (1 - params.tolerance) and abs(change) <= params.tolerance
+        )
         error = returns.std().item() / len(returns) ** 0.5
         row = {"beta": beta, "states": states, "inputs": inputs, "value": value, "monte_carlo": found, "standard_error": error}
         rows.append(row | {"difference": gap, "change": change, "minimum_variance_x": least, "agrees": float(agrees)})

@@ -22,6 +22,7 @@ class LoadStep:
     def __init__(self, process: Process, task: ControlTask, load: Tensor) -> None:
         self.process = process
         self.n_states, self.n_outputs, self.n_inputs = process.n_states, process.n_outputs, process.n_inputs
+        self.n_disturbances = process.n_disturbances
         self.n_steps = task.n_steps
         self.load = load
         self.time = 0

@@ -65,9 +65,11 @@ class OffsetFreeMPC:
         self.model = torch.from_numpy(np.block([[A, eye], [np.zeros_like(A), eye]]))
         self.input_model = torch.from_numpy(np.vstack([B, zero]))
         observed = np.hstack([eye, np.zeros_like(A)])
-        at_target = (process.disturbance_gain.double().numpy() * process.sampling_time**0.5 * target) ** 2
+        at_rest = torch.linalg.solve(process.drift_input, -process.drift_state @ task.set_point)
+        still = torch.zeros(n_x, n_x, dtype=at_rest.dtype)
+        at_target = process.moments(task.set_point, still, at_rest)[1].double().numpy()
         reading = np.maximum((process.observation_noise.double().numpy() * target) ** 2, np.finfo(float).eps)
-        noise = block_diag(np.diag(at_target), np.diag(disturbance_std**2 * at_target))
+        noise = block_diag(at_target, disturbance_std**2 * at_target)
         covariance = solve_discrete_are(self.model.numpy().T, observed.T, noise, np.diag(reading))
         self.filter_gain = torch.from_numpy(
             covariance @ observed.T @ np.linalg.inv(observed @ covariance @ observed.T + np.diag(reading))

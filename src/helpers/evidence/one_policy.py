@@ -14,6 +14,7 @@ from helpers.learning.features import discounts
 from helpers.learning.model_gradient import Descent, GradientRecord, model_gradient
 from helpers.learning.tracking_policy import Gains, TrackingPID, TrackingPolicy
 from helpers.plant.controllers import Controller
+from helpers.plant.process import LinearProcess
 from helpers.plant.task import Trajectories
 from helpers.plant.tracking import AtSetPoint, Bounds, Scenarios, Tracked, Tracker, track
 from helpers.runs.finished import State
@@ -119,7 +120,7 @@ class Ground:
             step * (torch.arange(n_steps)[:, None] >= begins)[..., None],
             task.initial_mean + task.initial_std * normal((n_episodes, n_x)),
             torch.zeros(n_episodes, n_u, dtype=session.dtype),
-            normal((n_steps, n_episodes, n_x)),
+            normal((n_steps, n_episodes, process.n_disturbances)),
             normal((n_steps + 1, n_episodes, process.n_outputs)),
         )
 
@@ -130,13 +131,14 @@ class Ground:
     def lost(self, scenarios: Scenarios, run: Tracked, beta: float) -> Tensor:
         """1 - J / J_max of each episode, (K,), with the tracking objective J of Eq. 5.1.2.1 on the true state.
 
-        Of each reward the expectation over the disturbance of its own step is taken, as in notebook 06: with the mean m and the
+        Of each reward the expectation over the last disturbance before it is taken, as in notebook 06: with the mean m and the
         standard deviation s of the next normalised error it is exp(-(beta m)^2 / w) / sqrt(w), w = 1 + 2 (beta s)^2. That has the
         same mean as the reward, a smaller variance, and a gradient where the reward itself has none.
         """
-        process, scale = self.session.process, self.error_scale(scenarios.set_point)
-        spread = process.disturbance(run.x[:-1]) * process.sampling_time**0.5
-        mean = (run.set_point - run.x[1:] + spread * scenarios.disturbance) / scale
+        process, scale = scenarios.process, self.error_scale(scenarios.set_point)
+        assert isinstance(process, LinearProcess)
+        after, spread = process.before_last_kick(run.x[:-1], run.u + scenarios.load, scenarios.disturbance)
+        mean = (run.set_point - after) / scale
         wide = 1 + 2 * (beta * spread / scale) ** 2
         reward = (torch.exp(-((beta * mean) ** 2) / wide) / wide.sqrt()).sum(-1)
         weights = discounts(len(reward), self.session.features.params.discount, reward)

@@ -40,7 +40,7 @@ class Reading:
         delay: the controller acts on the sample before.
         acts_on_state: the controller meets no observation noise.
         exact_drift: the drift is integrated exactly between two steps, not by Euler's rule; the disturbance is not.
-        substeps: Euler-Maruyama steps between two samples.
+        integration_steps: Euler-Maruyama steps between two samples, where there are not as many as in the parameter files.
         disturbance: "along" for every step, of the state before it; "behind" for every step, of the state behind its drift;
             "once" for a sample, of the state at its end; "milstein" for Milstein's rule.
         disturbance_power: the power of the step that scales the disturbance.
@@ -63,7 +63,7 @@ class Reading:
     start_as_variance: bool = False
     symmetric_bounds: bool = False
     exact_drift: bool = False
-    substeps: int = 1
+    integration_steps: int | None = None
     disturbance: str = "along"
     disturbance_power: float = 0.5
     one_disturbance: bool = False
@@ -77,6 +77,7 @@ class Reading:
 MAIN = Reading()
 READINGS = (
     MAIN,
+    *(Reading(f"{number} step{'s' * (number > 1)} a sample", integration_steps=number) for number in (1, 2, 3, 5, 8, 10, 20)),
     Reading("|e| before the first step is 1", first_error=1.0),
     Reading("|e| before the first step is 0", first_error=0.0),
     Reading("conditional integration", conditional_integration=True),
@@ -96,22 +97,26 @@ READINGS = (
     Reading("Type III on y", rate_on="y"),
     Reading("49 samples", samples=49),
     Reading("51 samples", samples=51),
-    Reading("exact drift, noise of the state before it", exact_drift=True),
-    Reading("exact drift, noise once at the end", exact_drift=True, disturbance="once"),
-    Reading("exact drift, noise along the way", exact_drift=True, substeps=8),
+    Reading("exact drift, noise along the way", exact_drift=True),
+    Reading("exact drift in 1 step, noise of the state before it", exact_drift=True, integration_steps=1),
+    Reading("exact drift in 1 step, noise at the end", exact_drift=True, disturbance="once", integration_steps=1),
     Reading("noise of the state behind the drift", disturbance="behind"),
     Reading("Milstein's rule", disturbance="milstein"),
     Reading("noise scaled by the step, not its root", disturbance_power=1.0),
     Reading("one Wiener process for both states", one_disturbance=True),
-    *(Reading(f"{number} steps a sample", substeps=number) for number in (2, 4, 5, 8, 10, 20)),
-    Reading("4 steps, noise once at the end", substeps=4, disturbance="once"),
-    Reading("4 steps, controller acts on x", substeps=4, acts_on_state=True),
-    Reading("4 steps, integral without the present error", substeps=4, present_error=0.0),
-    Reading("4 steps, one Wiener process", substeps=4, one_disturbance=True),
-    Reading("4 steps, spread of the initial state is a variance", substeps=4, start_as_variance=True),
-    Reading("4 steps, Type III on y", substeps=4, rate_on="y"),
-    Reading("4 steps, features on y", substeps=4, features_on="y"),
-    Reading("4 steps, 51 samples", substeps=4, samples=51),
+    Reading("noise once a sample, at the end", disturbance="once"),
+    *(
+        Reading(f"1 step, {name}", integration_steps=1, **changes)
+        for name, changes in (
+            ("controller acts on x", {"acts_on_state": True}),
+            ("integral without the present error", {"present_error": 0.0}),
+            ("one Wiener process", {"one_disturbance": True}),
+            ("spread of the initial state is a variance", {"start_as_variance": True}),
+            ("Type III on y", {"rate_on": "y"}),
+            ("features on y", {"features_on": "y"}),
+            ("51 samples", {"samples": 51}),
+        )
+    ),
 )
 
 
@@ -151,33 +156,29 @@ class ReadPID(PID):
 
 
 class ReadProcess(LinearProcess):
-    """The process of Eq. 4.1.3 under another reading.
-
-    The noise handed in is that of the first step after a sample; that of further ones comes from a generator of its own.
-    """
+    """The process of Eq. 4.1.3 under another reading; noise that stays in the state comes from a generator of its own."""
 
     def __init__(self, params: ProcessParams, reading: Reading, generator: torch.Generator) -> None:
-        step = params.model_copy(update={"sampling_time": params.sampling_time / reading.substeps})
-        super().__init__(exact_drift(step) if reading.exact_drift else step, DTYPE)
+        super().__init__(exact_drift(params) if reading.exact_drift else params, DTYPE)
         self.reading = reading
         self.generator = generator
-        self.spread = self.disturbance_gain * self.sampling_time**0.5
 
     def step(self, x: Tensor, u: Tensor, noise: Tensor) -> Tensor:
         """The state at the next sample."""
-        reading, still = self.reading, torch.zeros_like(noise)
-        for substep in range(reading.substeps):
-            w = torch.randn(x.shape, generator=self.generator, dtype=DTYPE) if substep else noise
-            w = w[:, :1].expand_as(w) if reading.one_disturbance else w
+        reading, still = self.reading, torch.zeros_like(x)
+        tau = self.sampling_time / self.integration_steps
+        spread = self.disturbance_gain * tau**0.5
+        behind = reading.disturbance == "behind"
+        for drawn in noise.split(self.n_states, dim=1):
+            w = drawn[:, :1].expand_as(drawn) if reading.one_disturbance else drawn
             if reading.disturbance == "milstein":
-                w = w + self.spread * (w**2 - 1) / 2
-            w = w * self.sampling_time ** (reading.disturbance_power - 0.5)
-            behind = reading.disturbance == "behind"
-            x = super().step(x, u, still if behind or reading.disturbance == "once" else w)
+                w = w + spread * (w**2 - 1) / 2
+            w = w * tau ** (reading.disturbance_power - 0.5)
+            x = self._integrated(x, u, still if behind or reading.disturbance == "once" else w)
             if behind:
-                x = x * (1 + self.spread * w)
+                x = x * (1 + spread * w)
         if reading.disturbance == "once":
-            x = x * (1 + self.spread * reading.substeps**0.5 * w)
+            x = x * (1 + spread * self.integration_steps**0.5 * w)
         return super().observe(x, torch.randn(x.shape, generator=self.generator, dtype=DTYPE)) if reading.observed_state else x
 
     def observe(self, x: Tensor, noise: Tensor) -> Tensor:
@@ -186,11 +187,11 @@ class ReadProcess(LinearProcess):
 
 
 def exact_drift(process: ProcessParams) -> ProcessParams:
-    """The process whose Euler step is the exact one: I + A' dt = exp(A dt), B' dt = integral of exp(A s) B over 0 <= s <= dt."""
+    """The process whose Euler step of length tau is exact: I + A' tau = exp(A tau), B' tau the integral of exp(A s) B up to tau."""
     A, B = torch.tensor(process.drift_state, dtype=DTYPE), torch.tensor(process.drift_input, dtype=DTYPE)
-    n_x, n_u = B.shape
+    (n_x, n_u), tau = B.shape, process.sampling_time / process.integration_steps
     whole = torch.cat([torch.cat([A, B], 1), torch.zeros(n_u, n_x + n_u, dtype=DTYPE)])
-    step = (torch.matrix_exp(whole * process.sampling_time) - torch.eye(n_x + n_u, dtype=DTYPE)) / process.sampling_time
+    step = (torch.matrix_exp(whole * tau) - torch.eye(n_x + n_u, dtype=DTYPE)) / tau
     return process.model_copy(update={"drift_state": step[:n_x, :n_x].tolist(), "drift_input": step[:n_x, n_x:].tolist()})
 
 
@@ -207,6 +208,8 @@ def with_settings(params: Params, values: Values, reading: Reading) -> Params:
         high[index] = values.get(("input_high", name), high[index] if bound is None else bound)
     time = values.get(TIME, process.sampling_time)
     process = process.model_copy(update={"sampling_time": time, "input_low": tuple(low), "input_high": tuple(high)})
+    if reading.integration_steps is not None:
+        process = process.model_copy(update={"integration_steps": reading.integration_steps})
     if reading.noise_as_variance:
         process = process.model_copy(update={"observation_noise": tuple(s**0.5 for s in process.observation_noise)})
     if reading.samples is not None:

@@ -65,7 +65,7 @@ def closed_loops(
         return torch.randn(n_times, n_episodes, n_variables, generator=draws, dtype=study.dtype).repeat(1, n, 1)
 
     x = [task.initial_mean + task.initial_std * draw(1, process.n_states)[0]]
-    disturbance, noise = draw(task.n_steps, process.n_states), draw(task.n_steps + 1, process.n_outputs)
+    disturbance, noise = draw(task.n_steps, process.n_disturbances), draw(task.n_steps + 1, process.n_outputs)
     y, u = [process.observe(x[0], noise[0])], []
     before = torch.zeros_like(x[0][:, : policy.n_manipulated])
     states = [(x[0].new_zeros(n, n_episodes, width),) * 2 for width in policy.params.hidden_cells]

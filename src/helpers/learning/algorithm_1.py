@@ -27,7 +27,9 @@ def algorithm_1(
         tau = learner.realise()  # 1. K episodes of T steps under pi_theta
         R = reward(tau)  #           R_1..R_T, Eq. 4.2.5 offline, 5.1.2.1 online
         A = learner.advantage(R, tau)  # G - b as printed; ours, where credit is not whole_return: reward-to-go less a regression
-        learner.ascend(tau, A)  # 2. theta <- theta + omega / K sum_k A^k grad sum_t ln pi(u_t | y_t), Eq. 3.2.4; ours: Adam
+        learner.ascend(
+            tau, A
+        )  # 2. theta <- theta + omega / K sum_k A^k grad sum_t ln pi(u_t | y_t), Eq. 3.2.4; ours: Adam, a critic
         records.append(learner.record(R, tau))
         watch(records[-1])
     return records

@@ -58,7 +58,7 @@ def differentiable(process: Process, x: Tensor, u: Tensor) -> bool:
     """Whether torch can differentiate the step of a process from states (K, n_x) in its inputs (K, n_u)."""
     u = u.detach().clone().requires_grad_()
     try:
-        return process.step(x, u, torch.zeros_like(x)).requires_grad
+        return process.step(x, u, x.new_zeros(len(x), process.n_disturbances)).requires_grad
     except RuntimeError:  # numpy takes no tensor that carries a gradient
         return False
 

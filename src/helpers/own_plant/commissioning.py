@@ -38,7 +38,7 @@ def commission(guard: Guard, process: Process, trial: Trial, generator: torch.Ge
     steady_y, steady_u = description.steady("controlled"), description.steady("manipulated")
     target = np.array([variable.set_point for variable in description.controlled])
     shape = (trial.n_samples, 1)
-    kicks = torch.randn(*shape, process.n_states, generator=generator, dtype=torch.float64)
+    kicks = torch.randn(*shape, process.n_disturbances, generator=generator, dtype=torch.float64)
     errors = torch.randn(*shape, process.n_outputs, generator=generator, dtype=torch.float64)
     x, rows, seconds = torch.zeros(1, process.n_states, dtype=torch.float64), [], []
     for t in range(trial.n_samples):

@@ -41,7 +41,7 @@ class ArmaxModel:
 
     def __post_init__(self) -> None:
         _, self.n_outputs, self.n_inputs = self.entry.shape
-        self.n_states = self.window.shape[2]
+        self.n_states, self.n_disturbances = self.window.shape[2], self.n_outputs
         self.growing = bool(self.spread[..., 1].any())
 
     def __len__(self) -> int:
@@ -56,7 +56,7 @@ class ArmaxModel:
         return replace(self, **{name: getattr(self, name).to(dtype) for name in ("window", "entry", "constant", "spread")})
 
     def step(self, x: Tensor, u: Tensor, noise: Tensor) -> Tensor:
-        """The next state, shape (K, n_x), of one model or of one an episode; of the noise (K, n_x) the first n_y columns count."""
+        """The next state, shape (K, n_x), of one model or of one an episode; of the noise the first n_y columns count."""
         n_y, n_u = self.n_outputs, self.n_inputs
         y = self.constant + (self.window @ x[..., None] + self.entry @ u[..., None])[..., 0]
         size = (self.spread[..., 0] ** 2 + (self.spread[..., 1] * y) ** 2).sqrt() if self.growing else self.spread[..., 0]
@@ -107,7 +107,7 @@ class GymnasiumPlant:
             raise InputError(f"plant '{GYMNASIUM}{environment}': it cannot be made: {error}") from error
         self.steady_y = description.steady("controlled")
         self.steady_u = description.steady("manipulated")
-        self.n_states = self.n_outputs = len(self.steady_y)
+        self.n_states = self.n_outputs = self.n_disturbances = len(self.steady_y)
         self.n_inputs = len(self.steady_u)
         self._stepped = False
         spaces = {
@@ -157,13 +157,13 @@ def load_plant(name: str, description: PlantDescription) -> Process:
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise InputError(f"plant '{name}': expected package.module:Class that takes the description: {error}") from error
     sizes = {"n_outputs": len(description.controlled), "n_inputs": len(description.manipulated)}
-    for key in ("n_states", "n_outputs", "n_inputs", "step", "observe"):
+    for key in ("n_states", "n_outputs", "n_inputs", "n_disturbances", "step", "observe"):
         if not hasattr(plant, key):
             raise InputError(f"plant '{name}': it lacks '{key}'")
         if getattr(plant, key) != sizes.get(key, getattr(plant, key)):
             raise InputError(f"plant '{name}': '{key}' is {getattr(plant, key)}, the description has {sizes[key]}")
-    x, u, y = (torch.zeros(1, n) for n in (plant.n_states, plant.n_inputs, plant.n_outputs))
-    for key, found, expected in (("step", plant.step(x, u, x), x), ("observe", plant.observe(x, y), y)):
+    x, u, y, w = (torch.zeros(1, n) for n in (plant.n_states, plant.n_inputs, plant.n_outputs, plant.n_disturbances))
+    for key, found, expected in (("step", plant.step(x, u, w), x), ("observe", plant.observe(x, y), y)):
         if found.shape != expected.shape:
             raise InputError(f"plant '{name}': '{key}' gave the shape {tuple(found.shape)}, expected {tuple(expected.shape)}")
     checked: Process = plant

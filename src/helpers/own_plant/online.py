@@ -75,7 +75,7 @@ class Improvement:
 def from_rest(process: Process, set_point: Tensor, load: Tensor, generator: torch.Generator) -> Scenarios:
     """Episodes of whatever stands for the plant, from its steady state; set points (T, K, n_y) and loads (T, K, n_u)."""
     n_steps, n_episodes, _ = set_point.shape
-    sizes = (n_steps, n_episodes, process.n_states), (n_steps + 1, n_episodes, process.n_outputs)
+    sizes = (n_steps, n_episodes, process.n_disturbances), (n_steps + 1, n_episodes, process.n_outputs)
     noise = [torch.randn(size, generator=generator, dtype=set_point.dtype) for size in sizes]
     start, before = set_point.new_zeros(n_episodes, process.n_states), set_point.new_zeros(n_episodes, process.n_inputs)
     return Scenarios(process, set_point, load, start, before, *noise)

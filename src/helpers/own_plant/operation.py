@@ -133,7 +133,7 @@ def draw_scenarios(
     set_point = torch.where((time >= to_third)[..., None], third, set_point)
     size = params.load * (2 * share(n_models, models.n_inputs) - 1) * operation.bounds.span
     load = torch.where((time >= to_load)[..., None], size * (share(n_models, 1) < 0.7), torch.zeros(()))
-    noise = torch.randn(n_steps, n_models, models.n_states, generator=generator, dtype=dtype) * (not quiet)
+    noise = torch.randn(n_steps, n_models, models.n_disturbances, generator=generator, dtype=dtype) * (not quiet)
     return Scenarios(
         models, set_point, load, start, before.clamp(operation.bounds.low, operation.bounds.high), noise,
         torch.zeros(n_steps + 1, n_models, models.n_outputs, dtype=dtype),

@@ -89,7 +89,7 @@ class NonlinearTank:
             raise ParameterError(f"{path}: key 'balance': the key is missing, and the nonlinear tank needs it")
         self.groups = params.balance
         self.steady = SteadyState.of(params.balance, tank)
-        self.n_states = self.n_outputs = len(self.steady.controlled)
+        self.n_states = self.n_outputs = self.n_disturbances = len(self.steady.controlled)
         self.n_inputs = len(self.steady.manipulated)
         self.sampling_time, self.time_unit = params.sampling_time, tank.time_unit
         self.disturbance = torch.tensor(params.disturbance, dtype=torch.float64) * params.sampling_time**0.5

@@ -30,7 +30,7 @@ def rollout(
         return torch.randn(n_times, n_variables, n_trajectories, generator=generator, dtype=task.set_point.dtype).mT.unbind(0)
 
     (start,) = draw(1, process.n_states)
-    disturbance, noise = draw(n_steps, process.n_states), draw(n_steps + 1, process.n_outputs)
+    disturbance, noise = draw(n_steps, process.n_disturbances), draw(n_steps + 1, process.n_outputs)
     x = [task.initial_mean + task.initial_std * start]
     y = [process.observe(x[0], noise[0])]
     u, command = [], []

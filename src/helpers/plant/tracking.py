@@ -44,7 +44,7 @@ class Scenarios:
         set_point: (T, K, n_y), known to the controller at sample t and judged at t + 1.
         load: (T, K, n_u), added to the input on its way to the plant, unknown to the controller.
         start, before: x_0 (K, n_x) and the input before it (K, n_u).
-        disturbance, noise: standard normal, (T, K, n_x) and (T + 1, K, n_y).
+        disturbance, noise: standard normal, (T, K, n_disturbances) and (T + 1, K, n_y).
     """
 
     process: Process

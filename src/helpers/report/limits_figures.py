@@ -23,6 +23,7 @@ LABELS = {
     "online_there": "improved on that plant",
     "clone": "cloning",
     "irl_reinforce": "IRL, then policy gradient",
+    "irl_alone": "IRL, then REINFORCE alone",
     "clone_reinforce": "cloning, then policy gradient",
     "csil_reinforce": "CSIL, then policy gradient",
     "scratch_reinforce": "policy gradient from scratch",

@@ -21,7 +21,7 @@ from helpers.report.statistics import FEWEST, median_interval
 from helpers.report.tables import symbol
 
 TUNED = 1.05  # of the objective it began with, for a search to have found other gains
-END_IN_REINFORCE = ("online", "irl_reinforce", "clone_reinforce", "csil_reinforce", "scratch_reinforce")
+END_IN_REINFORCE = ("online", "irl_reinforce", "irl_alone", "clone_reinforce", "csil_reinforce", "scratch_reinforce")
 
 
 def find(results: Results) -> dict[str, Any]:

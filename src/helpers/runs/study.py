@@ -163,11 +163,17 @@ class Study:
         return Learner(policy, self.process, features or self.features, params, n_episodes, n_epochs, generator)
 
     def online_learner(
-        self, policy: LSTMPolicy, n_episodes: int, n_epochs: int, generator: torch.Generator, features_on: str = "x"
+        self,
+        policy: LSTMPolicy,
+        n_episodes: int,
+        n_epochs: int,
+        generator: torch.Generator,
+        features_on: str = "x",
+        from_scratch: bool = False,
     ) -> Learner:
-        """A learner with the online settings of learning.yaml. The policy gets their exploration back."""
+        """A learner with the online settings of learning.yaml. The policy gets their exploration back; wider where untrained."""
         online = self.params.learning.online
-        policy.reset_exploration(online.exploration)
+        policy.reset_exploration(online.from_scratch if from_scratch else online.exploration)
         return self.learner(policy, n_episodes, n_epochs, online.learner, generator, self.features.on(features_on))
 
     def online_episodes(self, asked: int | None = None) -> int:
@@ -219,15 +225,16 @@ class Study:
         records = (IterationRecord(**row | {"weights": tuple(row["weights"])}) for row in kept["records"])
         return Apprenticeship(kept["weights"], copied(policy, kept["policy"]), kept["epoch"], tuple(records))
 
-    def improve(self, policy: LSTMPolicy, features_on: str, episodes: int | None = None) -> Improvement:
+    def improve(self, policy: LSTMPolicy, features_on: str, episodes: int | None = None, from_scratch: bool = False) -> Improvement:
         """Online learning: the case's rounds of Algorithm 1 under the tracking objective, read from x or from y.
 
-        `episodes` an epoch, each a run of the plant, are those of the parameter files unless given.
+        `episodes` an epoch, each a run of the plant, are those of the parameter files unless given. A policy that begins
+        `from_scratch` explores further.
         """
         online = self.params.case.online
         epochs = self.online_epochs()
         generator = self.stream("online", self.variant, features_on)
-        learner = self.online_learner(policy, self.online_episodes(episodes), sum(epochs), generator, features_on)
+        learner = self.online_learner(policy, self.online_episodes(episodes), sum(epochs), generator, features_on, from_scratch)
 
         def train() -> State:
             records = improve_online(learner, epochs, online.beta, ProgressBar(sum(epochs), f"online on {features_on}"))

@@ -56,6 +56,7 @@ class ProcessParams(Record):
     disturbance: Annotated[Vector, Leaf("1/sqrt(time)")]
     observation_noise: Annotated[tuple[NotNegative, ...], Leaf("-")]
     sampling_time: Annotated[Positive, Leaf("time")]
+    integration_steps: Annotated[Count, Leaf("steps")]
     horizon: Annotated[Count, Leaf("samples")]
     input_low: Annotated[Vector, Leaf(DEVIATION)]
     input_high: Annotated[Vector, Leaf(DEVIATION)]
@@ -224,6 +225,7 @@ class OnlineLearningParams(Record):
 
     episodes: Annotated[Count, Field(gt=1, le=EPISODES_PER_EPOCH), Leaf("episodes")]
     exploration: ExplorationParams
+    from_scratch: ExplorationParams
     learner: LearnerParams
 
 

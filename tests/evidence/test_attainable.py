@@ -110,3 +110,10 @@ def test_the_stationary_policy_stays_that_of_the_first_sample(study):
     for _ in range(case.task.n_steps + 3):
         command, memory = policy.act(case.task.set_point[None], memory)
     assert torch.equal(command, Tabulated(optimum).act(case.task.set_point[None], 0)[0])
+
+
+def test_single_precision_changes_little(study):
+    """The number type of the paper's scale."""
+    axes = (np.linspace(-4, 3, 7), np.linspace(-8, 12, 7))
+    steps = [one_step(case.process, case.task, 30.0, axes, Resolution(7, 5, 3)) for case in (study(1, torch.float32), study(1))]
+    np.testing.assert_allclose(steps[0].reward, steps[1].reward, atol=1e-5)

@@ -117,7 +117,7 @@ def test_the_coherent_reward_is_greatest_where_the_clone_acts(contest):
 
 
 def test_the_reward_is_dense_at_first_where_asked(contest):
-    assert [contest.sharpness(episodes, True) for episodes in (0, 2, 3, 24)] == [10.0, 10.0, 30.0, 30.0]
+    assert [contest.sharpness(episodes, True) for episodes in (0, 2, 3, 24)] == [3.0, 3.0, 30.0, 30.0]
     assert contest.sharpness(0, False) == 30.0
 
 

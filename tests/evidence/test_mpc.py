@@ -59,3 +59,9 @@ def test_a_short_horizon_without_move_penalty_is_minimum_variance(study):
     rest = torch.zeros(1, 2, dtype=torch.float64)
     plan = controller.plan(torch.cat([x, rest, rest, torch.ones(1, 1, dtype=torch.float64)], 1).numpy())
     assert plan == pytest.approx(known.act(x, None)[0].numpy(), rel=1e-3)
+
+
+def test_single_precision_changes_little(study):
+    """The number type of the paper's scale, in which a covariance is symmetric to its last digit but one."""
+    gains = [OffsetFreeMPC(case.process, case.task, 10, 0.01, 0.1).filter_gain for case in (study(1, torch.float32), study(1))]
+    torch.testing.assert_close(*gains, rtol=1e-4, atol=1e-6)

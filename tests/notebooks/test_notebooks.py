@@ -93,7 +93,8 @@ def test_the_committed_lesson_tells_the_papers_story():
         assert stored(name, "session.outcome(", "feature gap, %")[0] < 10
     for name in ("03_online_improvement", "04_knowledge_transfer"):
         pid, offline, online, online_on_y, best = stored(name, "tables.quality_table(", "$J$ on $x$ ")
-        assert offline < pid < min(online, online_on_y) < best
+        assert offline < pid < min(online, online_on_y)
+        assert 0.97 * best < min(online, online_on_y)
 
 
 LINK = re.compile(r"\[([^\]]+)\]\((?!https?:)([^)#]+)\)")

@@ -94,7 +94,7 @@ def test_the_gate_releases_what_is_better_and_nothing_else(operation, params):
     slow, good = TrackingPID(pid(0.5, 0.05), operation.bounds), TrackingPID(pid(1.5, 0.12), operation.bounds)
 
     def verdict(policy, allowed, **others):
-        one_each = params.gate.model_copy(update={"episodes": 1, "corner_episodes": 1})
+        one_each = params.gate.model_copy(update={"episodes": 1, "corner_episodes": 8})
         return judge({RECORD: slow, **others, POLICY: policy}, (noisy, quiet, noisy), operation, allowed, one_each)
 
     better = verdict(good, 10.0)
@@ -127,5 +127,5 @@ def test_a_controller_that_fails_at_an_end_of_the_margins_is_not_released(operat
     assert verdict(noisy, 8).released
     assert not verdict(corners, 8).released
     assert "at an end of the margins its mean |e| is" in verdict(corners, 8).words
-    worst = [verdict(corners, each).table.loc[POLICY, "worst corner"] for each in (1, 8, 32)]
+    worst = [verdict(corners, each).table.loc[POLICY, "worst corner"] for each in (2, 8, 32)]
     assert worst[0] > worst[1] > worst[2]

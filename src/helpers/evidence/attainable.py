@@ -152,7 +152,8 @@ def _moments(process: LinearProcess, x: Array, u: Array) -> tuple[Array, Array, 
     The third is that which each state would have by itself: what reaches it by way of the others is left out.
     """
     shape = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
-    mean, entry = (torch.from_numpy(np.broadcast_to(part, (*shape, part.shape[-1])).copy()) for part in (x, u))
+    dtype = process.state_step.dtype
+    mean, entry = (torch.from_numpy(np.broadcast_to(part, (*shape, part.shape[-1])).copy()).to(dtype) for part in (x, u))
     covariance, third = torch.zeros_like(mean).diag_embed(), torch.zeros_like(mean)
     tau = process.sampling_time / process.integration_steps
     kept, kick = 1 + tau * process.drift_state.diagonal(), tau * process.disturbance_gain**2
@@ -161,7 +162,7 @@ def _moments(process: LinearProcess, x: Array, u: Array) -> tuple[Array, Array, 
         twice = 2 * mean * covariance.diagonal(dim1=-2, dim2=-1)
         third = kept**3 * third + 3 * kept * kick * (third + twice)
         mean, covariance = process.moments(mean, covariance, entry, steps=1)
-    return mean.numpy(), covariance.diagonal(dim1=-2, dim2=-1).sqrt().numpy(), third.numpy()
+    return mean.double().numpy(), covariance.diagonal(dim1=-2, dim2=-1).double().sqrt().numpy(), third.double().numpy()
 
 
 def expected_value(step: OneStep, spline: Array) -> Array:

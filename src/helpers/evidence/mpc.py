@@ -67,7 +67,8 @@ class OffsetFreeMPC:
         observed = np.hstack([eye, np.zeros_like(A)])
         at_rest = torch.linalg.solve(process.drift_input, -process.drift_state @ task.set_point)
         still = torch.zeros(n_x, n_x, dtype=at_rest.dtype)
-        at_target = process.moments(task.set_point, still, at_rest)[1].double().numpy()
+        found = process.moments(task.set_point, still, at_rest)[1].double().numpy()
+        at_target = (found + found.T) / 2  # to the last digit, which the solver asks for
         reading = np.maximum((process.observation_noise.double().numpy() * target) ** 2, np.finfo(float).eps)
         noise = block_diag(at_target, disturbance_std**2 * at_target)
         covariance = solve_discrete_are(self.model.numpy().T, observed.T, noise, np.diag(reading))

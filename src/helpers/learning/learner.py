@@ -26,6 +26,7 @@ from helpers.settings.paper import LearnerParams
 
 BLOCK = 1000  # episodes whose gradient is computed at once: more would only take memory
 FEW = 100  # episodes below which torch's own LSTM is faster than the gradient through time written out: 7 against 17 ms for 50
+NOTHING = "every episode earned the same reward, so there is nothing to learn from"
 
 
 class TrainingError(RuntimeError):
@@ -195,14 +196,14 @@ class Learner:
         if not spread > 0 and self.led == 1:
             return advantage  # nobody asks for it
         if not spread > 0:
-            raise TrainingError(f"epoch {self.epochs + 1}: every episode earned the same reward, so there is nothing to learn from")
+            raise TrainingError(f"epoch {self.epochs + 1}: {NOTHING}")
         return advantage / spread
 
     def ascend(self, batch: Trajectories, advantage: Tensor) -> None:
         """Step 2 of Algorithm 1: along the policy gradient, at this epoch's step size; then the average of the weights.
 
         Raises:
-            TrainingError: if the gradient is not finite.
+            TrainingError: if the gradient is not finite, or the critic expects the same reward of every input.
         """
         params = self.params
         self.rate = annealed(params.learning_rate_start, params.learning_rate_end, self.epochs / max(1, self.total_epochs - 1))
@@ -282,6 +283,8 @@ class Learner:
                 if parameter.grad is not None and not parameter.grad.isfinite().all():
                     cause = f"the gradient of {name} is not finite at the learning rate {self.rate:g}"
                     raise TrainingError(f"epoch {self.epochs + 1}: {cause}")
+            if led == 1 and not any(parameter.grad.any() for parameter in self.policy.parameters() if parameter.grad is not None):
+                raise TrainingError(f"epoch {self.epochs + 1}: {NOTHING}")
             self.optimiser.step(self.rate)
             self.gradient_steps += 1
 

@@ -78,7 +78,7 @@ class GateParams(Record):
 
     models: Annotated[Count, Leaf("models")]
     episodes: Annotated[Count, Leaf("episodes")]
-    corner_episodes: Annotated[Count, Leaf("episodes")]
+    corner_episodes: Annotated[Count, Field(gt=1), Leaf("episodes")]
     better: Annotated[Share, Leaf("share")]
     offset: Annotated[Share, Leaf("range of the set points")]
     close: Annotated[Share, Leaf("share")]

@@ -33,6 +33,11 @@ VARIABLE = re.compile(r"(?<![A-Za-z_])(C_A0|C_A|T_E)(?![A-Za-z0-9_])")
 LOOP = re.compile(r"(.*)\((\w+)\) control loop")
 
 
+def case_study(case: int) -> str:
+    """A case as the paper calls it."""
+    return f"Case Study {ROMAN[case - 1]}"
+
+
 def symbol(name: str) -> str:
     """A variable in TeX: C_A0 becomes $C_{A0}^*$; the star marks a deviation variable, as in the paper."""
     letter, _, index = name.partition("_")

@@ -16,7 +16,6 @@ from helpers.runs.artifacts import ArtifactError, load_stage, save_stage
 from helpers.runs.sources import PROJECT
 
 CASES = (1, 2, 3)
-TABLE_OF_CASE = {1: 2, 2: 3, 3: 4}
 FEATURES = ["C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III"]
 COST = {"epochs", "episodes", "gradient_steps"}
 INPUTS, PARAMS = PROJECT / "notebooks/inputs", PROJECT / "params"
@@ -206,9 +205,8 @@ def test_what_an_older_report_left_is_replaced_and_other_files_stay(written):
 def test_comparison_has_one_row_for_each_published_number(written):
     table = pd.read_csv(written / "comparison.csv")
     assert list(table) == scorecard.COLUMNS
-    keys = [(TABLE_OF_CASE[case], case, row, name) for case, row, name in product(CASES, ("expert", "policy", "alpha"), FEATURES)]
-    assert len(table) == 54
-    assert set(table[["table", "case", "row", "feature"]].itertuples(index=False, name=None)) == set(keys)
+    keys = [(case + 1, case, row, name) for case, row, name in product(CASES, ("expert", "policy", "alpha"), FEATURES)]
+    assert sorted(table[["table", "case", "row", "feature"]].itertuples(index=False, name=None)) == sorted(keys)
     assert (table["n_seeds"] == 1).all()
     assert table[["published", "reproduced"]].notna().all(axis=None)
     assert table[["ci_low", "ci_high", "pred_low", "pred_high"]].isna().all(axis=None)

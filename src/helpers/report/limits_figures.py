@@ -42,18 +42,9 @@ LABELS = {
     "dynamic_programme_filtered": "programme, filtered y",
     "dynamic_programme": "programme on x",
 }
-LEARNERS = (
-    "irl_reinforce",
-    "clone_reinforce",
-    "csil_reinforce",
-    "scratch_reinforce",
-    "ppo",
-    "recurrent_ppo",
-    "pid_tuned",
-    "pid_scheduled",
-)
 THE_PAPERS = "irl_reinforce"
-RIVALS = tuple(name for name in LEARNERS if name != THE_PAPERS)  # they need no model
+RIVALS = ("clone_reinforce", "csil_reinforce", "scratch_reinforce", "ppo", "recurrent_ppo", "pid_tuned", "pid_scheduled")
+LEARNERS = (THE_PAPERS, *RIVALS)  # the rivals need no model
 LEVELS = ("one_policy", "mpc", "minimum_variance", "expert", "dynamic_programme")
 RUNS = {"hot": "hot start", "cloned": "from the clone", "scratch": "from scratch"}
 NOTHING = "#c8c8c8"  # under a condition in which no controller earns anything

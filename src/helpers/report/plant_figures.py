@@ -107,12 +107,12 @@ def progress_figure(records: Sequence[GradientRecord]) -> Figure:
     return figure
 
 
-def validation_figure(validation: Validation, description: PlantDescription, window: int = 0) -> Figure:
-    """The identified model on held-out records: one window simulated from its inputs, and the residuals' autocorrelation."""
+def validation_figure(validation: Validation, description: PlantDescription) -> Figure:
+    """The identified model on held-out records: the first window simulated from its inputs, and the residuals' autocorrelation."""
     variables = description.controlled
     figure = empty_figure(WIDTH, 2.6 * len(variables) + 0.5)
     axes = figure.subplots(len(variables), 2, squeeze=False)
-    measured, simulated = validation.measured[window], validation.simulated[window]
+    measured, simulated = validation.measured[0], validation.simulated[0]
     for index, (variable, (left, right)) in enumerate(zip(variables, axes, strict=True)):
         left.plot(measured[:, index], color=MEASURED, linestyle=LINE_STYLES["expert"], label="measured")
         left.plot(simulated[:, index], color=SIMULATED, label="simulated from the inputs")

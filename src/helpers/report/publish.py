@@ -13,7 +13,7 @@ import pandas as pd
 
 from helpers.report.limits_figures import LABELS, LEARNERS
 from helpers.report.policies import write_policies
-from helpers.report.tables import ROMAN, spread
+from helpers.report.tables import NOT_KNOWN, ROMAN, spread
 from helpers.runs.artifacts import code_revision
 from helpers.runs.sources import PROJECT
 
@@ -85,7 +85,7 @@ def time_by_stage(time: pd.DataFrame) -> str:
     """README's seconds by stage and case, as Markdown, from tables/time.csv."""
     wide = time.pivot_table(index="stage", columns="case", values="seconds")
     wide.columns = [f"case {case}, s" for case in wide.columns]
-    cells = wide.map(lambda seconds: "–" if pd.isna(seconds) else f"{seconds:.0f}").reset_index()
+    cells = wide.map(lambda seconds: NOT_KNOWN if pd.isna(seconds) else f"{seconds:.0f}").reset_index()
     return f"Seconds inside each stage's notebook, medians over seeds, two stages at a time:\n\n{cells.to_markdown(index=False)}"
 
 

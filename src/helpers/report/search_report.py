@@ -111,17 +111,13 @@ def search(scale: str, cases: Sequence[int], results: Path) -> None:
         weights.append(sampled(kept, case))
     if set(cases) < set(published):
         return
-    tables = {"trials.csv": pd.concat(trials), "weights.csv": pd.concat(weights)}
-    tables["best.csv"] = best_of(tables["trials.csv"])
-    of_best = tables["trials.csv"][tables["trials.csv"]["setting"] == tables["trials.csv"]["case"].map(best)]
+    tried, drawn = pd.concat(trials), pd.concat(weights)
+    tables = {"trials.csv": tried, "weights.csv": drawn, "best.csv": best_of(tried)}
     learnt = {
-        r"$\alpha^*$ as printed, best settings": of_best,
+        r"$\alpha^*$ as printed, best settings": tried[tried["setting"] == tried["case"].map(best)],
         rf"$\alpha^*$, {HEADLINE}": headline_weights(REFERENCE / "seeds.csv"),
     }
-    figures = {
-        "gaps": gap_figure(tables["trials.csv"], published),
-        "weights": weights_figure(tables["weights.csv"], learnt, published),
-    }
+    figures = {"gaps": gap_figure(tried, published), "weights": weights_figure(drawn, learnt, published)}
     for figure in figures.values():
         lay_out(figure)
     folder = REFERENCE / "search" if scale == "paper" else results / scale / "search"

@@ -151,25 +151,29 @@ def test_control_figure_names_panels_variables_units_and_all_that_is_drawn(n_loo
     assert all(part in shown for part in parts)
 
 
-KINDS = [
-    pytest.param(kind, marks=pytest.mark.torture)
-    for kind in ("seeds", "curves", "tracking", "online", "budget", "mdp", "framework", "network")
-]
+def budget_figure() -> Figure:
+    rows = [(s, c, n, c + s + n / 500) for s in range(3) for c in (1, 2) for n in (500, 20, 100)]
+    budget = pd.DataFrame(rows, columns=["seed", "case", "episodes_per_epoch", "objective"])
+    levels = {"PID": 1.5, "offline policy": 1.2, "minimum variance on y": 5.0}
+    return figures.budget_figure(budget, {1: levels, 2: levels}, {1: "Case Study I", 2: "Case Study II"})
 
 
-@pytest.mark.parametrize("kind", ["control", *KINDS])
+KINDS = {
+    "control": lambda: draw(3),
+    "tracking": lambda: figures.tracking_figure(response(), OUTPUTS[:2], SET_POINTS[:2], WORDS),
+    "curves": lambda: figures.learning_curves(history(), {40: "policy kept"}, {"PID": 3.0}, {"paper": 0.1}),
+    "online": lambda: figures.learning_curves(history()[["epochs", "mean_return"]], {10: "second round"}, {"PID": 3.0}),
+    "seeds": lambda: draw(2, several(response(), ["mean"])),
+    "budget": budget_figure,
+    "mdp": drawings.mdp_figure,
+    "framework": drawings.framework_figure,
+    "network": lambda: drawings.network_figure((20, 20), 2, 2, 0.01),
+}
+
+
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=pytest.mark.torture if kind != "control" else ()) for kind in KINDS])
 def test_nothing_is_cut_off_and_no_panels_overlap(kind: str) -> None:
-    figure = {
-        "control": lambda: draw(3),
-        "tracking": lambda: figures.tracking_figure(response(), OUTPUTS[:2], SET_POINTS[:2], WORDS),
-        "curves": lambda: figures.learning_curves(history(), {40: "policy kept"}, {"PID": 3.0}, {"paper": 0.1}),
-        "online": lambda: figures.learning_curves(history()[["epochs", "mean_return"]], {10: "second round"}, {"PID": 3.0}),
-        "seeds": lambda: draw(2, several(response(), ["mean"])),
-        "budget": budget_figure,
-        "mdp": drawings.mdp_figure,
-        "framework": drawings.framework_figure,
-        "network": lambda: drawings.network_figure((20, 20), 2, 2, 0.01),
-    }[kind]()
+    figure = KINDS[kind]()
     figure.draw_without_rendering()
     drawn = figure.get_tightbbox()
     assert (drawn.min >= -0.01).all()
@@ -220,8 +224,8 @@ def test_several_seeds_are_thin_lines_about_their_median() -> None:
     panel = next(axes for axes in figure.axes if axes.get_label() == "B T")
     (line,) = [line for line in panel.lines if line.get_label() == "controlled, agent"]
     np.testing.assert_allclose(curve(line)[:, 1], expected["mean"] + 1.5)
-    thin = {label: paths for label, paths in ((c.get_label(), c.get_paths()) for c in panel.collections) if label == figures.SINGLE}
-    assert len(thin[figures.SINGLE]) == 4
+    (*_, thin) = [collection for collection in panel.collections if collection.get_label() == figures.SINGLE]
+    assert len(thin.get_paths()) == 4
     summary = figures.drawn_summary(figure).query("panel == 'B T' and artist == @figures.SINGLE")
     assert len(summary) == 8  # of expert and agent
     assert np.isin(np.round(expected["mean"].max() + np.array([0.0, 1, 2, 10]), 9), summary["maximum"].round(9)).all()
@@ -252,16 +256,6 @@ def test_learning_curves_of_several_seeds_show_each_and_their_median() -> None:
     assert [len(axes.collections) for axes in figure.axes] == [1, 1, 6]
     assert all(len(collection.get_paths()) == 4 for axes in figure.axes for collection in axes.collections)
     assert "each of 4 seeds" in texts(figure)
-
-
-def budget() -> pd.DataFrame:
-    rows = [(s, c, n, c + s + n / 500) for s in range(3) for c in (1, 2) for n in (500, 20, 100)]
-    return pd.DataFrame(rows, columns=["seed", "case", "episodes_per_epoch", "objective"])
-
-
-def budget_figure() -> Figure:
-    levels = {"PID": 1.5, "offline policy": 1.2, "minimum variance on y": 5.0}
-    return figures.budget_figure(budget(), {1: levels, 2: levels}, {1: "Case Study I", 2: "Case Study II"})
 
 
 def test_the_budget_curve_shows_median_seeds_and_references() -> None:
@@ -324,7 +318,7 @@ def test_the_drawings_name_what_they_show() -> None:
 def test_drawn_summary_reads_back_what_was_drawn() -> None:
     table = response()
     summary = figures.drawn_summary(draw(2, table)).set_index(["panel", "artist"])
-    mean = rows_of(table, "agent", "T")["mean"].to_numpy()
+    mean, std = rows_of(table, "agent", "T")[["mean", "std"]].to_numpy().T
     row = summary.loc[("B T", "controlled, agent")]
     assert row["points"] == N_STEPS + 1
     assert (row["from"], row["to"]) == (0, N_STEPS)
@@ -332,24 +326,11 @@ def test_drawn_summary_reads_back_what_was_drawn() -> None:
         [mean[0], mean.min(), mean.max(), mean.mean(), mean[-1]]
     )
     assert summary.loc[("D T zoom", "set point"), "mean"] == 4.0
+    band = summary.loc[("B T", f"controlled, agent: {figures.BAND}")]
+    assert band[["minimum", "maximum"]].tolist() == pytest.approx([(mean - std).min(), (mean + std).max()])
     bands = [label for _, label in summary.index if "standard deviation" in label]
     assert len(bands) == 8
     assert len(summary) == 12 + 8 + 4
-
-
-@pytest.mark.parametrize(
-    ("variable", "column"),
-    [("T", "mean"), ("C_A0", "std")]
-    + [pytest.param(variable, "mean", marks=pytest.mark.torture) for variable in ("C_A", "C_A0", "T_E")]
-    + [pytest.param(variable, "std", marks=pytest.mark.torture) for variable in ("C_A", "T", "T_E")],
-)
-def test_drawn_summary_notices_a_change_of_one_percent(column: str, variable: str) -> None:
-    table = response()
-    before = figures.drawn_summary(draw(2, table)).select_dtypes("number")
-    changed = table.copy()
-    changed.loc[(changed["variable"] == variable) & (changed["controller"] == "agent"), column] *= 1.01
-    after = figures.drawn_summary(draw(2, changed)).select_dtypes("number")
-    assert not np.allclose(before, after, rtol=1e-5)
 
 
 def test_style_does_not_change_what_was_drawn() -> None:

@@ -227,10 +227,10 @@ def against_headline(trials: pd.DataFrame) -> dict[str, str]:
     """
     gaps = trials.pivot_table(index=["case", "seed"], columns="trial", values="gap")
     found = {}
-    for name in gaps.drop(columns=HEADLINE):
+    for name, differences in gaps.drop(columns=HEADLINE).sub(gaps[HEADLINE], axis=0).items():
         cases: dict[str, list[str]] = {"better": [], "worse": []}
-        for case, differences in (gaps[name] - gaps[HEADLINE]).dropna().groupby("case"):
-            low, high = median_interval(differences.to_numpy())
+        for case, of_case in differences.dropna().groupby("case"):
+            low, high = median_interval(of_case.to_numpy())
             if word := "better" if high < 0 else "worse" if low > 0 else "":
                 cases[word].append(ROMAN[case - 1])
         found[name] = "; ".join(f"{word} in {', '.join(numerals)}" for word, numerals in cases.items() if numerals) or NOT_KNOWN

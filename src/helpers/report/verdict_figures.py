@@ -56,8 +56,7 @@ def comparison_figure(compared: pd.DataFrame) -> Figure:
         rows = compared[compared["table"] == table]
         for index, row in rows.iterrows():
             ours, low, high = relative.loc[index]
-            y = heights[row["row"], row["feature"]]
-            mark = MARKS[row["verdict"]]
+            y, mark = heights[row["row"], row["feature"]], MARKS[row["verdict"]]
             axes.plot([low, high], [y, y], color=mark["color"], linewidth=1.3)
             axes.plot([ours], [y], label=f"{row['row']} {row['feature']}", markersize=5.5, **mark)
         axes.axvline(0, color=INK, linewidth=1)
@@ -87,12 +86,10 @@ def claims_figure(judged: pd.DataFrame) -> Figure:
     """
     cases = [column for column in judged if column in ROMAN]
     lines = [fill(statement, 96) for statement in judged["statement"]]
-    figure = empty_figure(WIDTH, 0.9 + 0.155 * sum(line.count("\n") + 1.4 for line in lines))
+    sizes = np.array([line.count("\n") + 1.4 for line in lines])
+    ends = np.cumsum([0, *sizes])
+    figure, heights = empty_figure(WIDTH, 0.9 + 0.155 * ends[-1]), -ends[:-1] - sizes / 2
     axes = figure.subplots()
-    height, heights = 0.0, []
-    for line in lines:
-        heights.append(height - (line.count("\n") + 1.4) / 2)
-        height -= line.count("\n") + 1.4
     for x, case in enumerate(cases):
         for y, verdict in zip(heights, judged[case], strict=True):
             if verdict:
@@ -100,7 +97,7 @@ def claims_figure(judged: pd.DataFrame) -> Figure:
     axes.set_yticks(heights, lines, fontsize=8)
     axes.set_xticks(range(len(cases)), cases)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
-    axes.set(xlim=(-0.6, len(cases) - 0.4), ylim=(height, 0))
+    axes.set(xlim=(-0.6, len(cases) - 0.4), ylim=(-ends[-1], 0))
     axes.set_label("claims")
     axes.spines[["left", "bottom"]].set_visible(False)
     listed = _handles(("holds", "in part", "does not hold", "cannot tell", "not comparable"), judged[cases].to_numpy().ravel())

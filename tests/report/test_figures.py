@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import torch
 from matplotlib.collections import PolyCollection
-from matplotlib.colors import to_hex
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.transforms import Bbox
@@ -73,28 +73,17 @@ def legend_lines(figure: Figure) -> dict[str, Line2D]:
 
 
 def test_response_table_holds_mean_and_deviation_of_true_states_and_applied_inputs() -> None:
-    x = torch.tensor([[[1.0], [3.0]], [[2.0], [2.0]]])
-    u = torch.tensor([[[5.0], [7.0]]])
-    batch = Trajectories(x, x + 100, u, u + 100)
-    table = response_table(batch, batch, ("T",), ("T_E",))
+    x, u = torch.tensor([[[1.0], [3.0]], [[2.0], [2.0]]]), torch.tensor([[[5.0], [7.0]]])
+    batches = {"agent": 1, "expert": 10}
+    table = response_table(*(Trajectories(k * x, x + 100, k * u, u + 100) for k in batches.values()), ("T",), ("T_E",))
     assert list(table.columns) == ["controller", "variable", "kind", "time_index", "mean", "std"]
-    for controller in ("agent", "expert"):
-        states, inputs = rows_of(table, controller, "T"), rows_of(table, controller, "T_E")
-        assert states["kind"].unique() == ["controlled"]
-        assert inputs["kind"].unique() == ["manipulated"]
-        assert states["time_index"].tolist() == [0, 1]
-        assert inputs["time_index"].tolist() == [0]
-        assert states["mean"].tolist() == [2.0, 2.0]
-        assert inputs["mean"].tolist() == [6.0]
-        assert states["std"].tolist() == pytest.approx([2**0.5, 0.0])
-        assert inputs["std"].tolist() == pytest.approx([2**0.5])
-
-
-def test_response_table_keeps_agent_and_expert_apart() -> None:
-    table = response()
-    agent, expert = trajectories(2, 0), trajectories(2, 1)
-    np.testing.assert_allclose(rows_of(table, "agent", "T")["mean"], agent.x[..., 1].double().mean(1), rtol=1e-9)
-    np.testing.assert_allclose(rows_of(table, "expert", "C_A0")["std"], expert.u[..., 0].double().std(1), rtol=1e-9)
+    for controller, k in batches.items():
+        states, inputs = (rows_of(table, controller, name).drop(columns=["controller", "variable"]) for name in ("T", "T_E"))
+        assert states.to_numpy().tolist() == [
+            ["controlled", 0, 2.0 * k, pytest.approx(k * 2**0.5)],
+            ["controlled", 1, 2.0 * k, 0.0],
+        ]
+        assert inputs.to_numpy().tolist() == [["manipulated", 0, 6.0 * k, pytest.approx(k * 2**0.5)]]
 
 
 @pytest.mark.parametrize("n_loops", [1, 2, 3])
@@ -129,30 +118,24 @@ def test_control_figure_draws_every_response_as_given(n_loops: int) -> None:
 
 def test_control_figure_has_the_colours_of_the_paper_and_styles_that_differ() -> None:
     drawn = draw()
-    shown = legend_lines(drawn)
-    hues = {label.split(r" $\pi")[0]: to_hex(line.get_color()) for label, line in shown.items()}
-
-    def channels(label: str) -> tuple[int, int, int]:
-        return tuple(int(hues[label][start : start + 2], 16) for start in (1, 3, 5))  # type: ignore[return-value]
-
-    red, green, blue = channels("controlled variable, agent")
-    assert red > 2 * max(green, blue)
-    red, green, blue = channels("manipulated variable, agent")
-    assert blue > 2 * max(red, green)
-    dark, light = channels("controlled variable, PID"), channels("manipulated variable, PID")
-    assert dark[1] > 1.5 * max(dark[0], dark[2])
-    assert light[1] > 1.5 * max(light[0], light[2])
+    shown = {label.split(r" $\pi")[0]: line for label, line in legend_lines(drawn).items()}
+    hues = {label: to_hex(line.get_color()) for label, line in shown.items()}
+    channels = {label: np.array(to_rgb(hue)) for label, hue in hues.items()}
+    dark, light = channels["controlled variable, PID"], channels["manipulated variable, PID"]
+    for strongest, colour, times in (
+        (0, channels["controlled variable, agent"], 2),
+        (2, channels["manipulated variable, agent"], 2),
+        (1, dark, 1.5),
+        (1, light, 1.5),
+    ):
+        assert colour[strongest] > times * np.delete(colour, strongest).max()
     assert light[1] > 1.5 * dark[1]
-    red, green, blue = channels("set point")
+    red, green, blue = channels["set point"]
     assert red > green > blue
-    styles = {label: line.get_linestyle() for label, line in shown.items()}
-    agents = {style for label, style in styles.items() if "agent" in label}
-    experts = {style for label, style in styles.items() if "PID" in label}
-    assert agents == {"-"}
-    assert experts == {"--"}
+    styles = {name: {line.get_linestyle() for label, line in shown.items() if name in label} for name in ("agent", "PID")}
+    assert styles == {"agent": {"-"}, "PID": {"--"}}
     for axes in drawn.axes:  # the legend speaks of the lines that are drawn
-        for line in axes.lines:
-            assert to_hex(line.get_color()) in hues.values()
+        assert {to_hex(line.get_color()) for line in axes.lines} <= set(hues.values())
 
 
 @pytest.mark.parametrize("n_loops", [2, 3])
@@ -164,56 +147,48 @@ def test_control_figure_names_panels_variables_units_and_all_that_is_drawn(n_loo
     for axes in figure.axes:
         assert DEVIATION in axes.get_ylabel().replace("\n", " ")
     assert shown.count("control interaction (sample)") == 2 * n_loops
-    for part in (
-        "Jacket temperature $T_E^*$",
-        "$C_{A0}^*$",
-        "agent",
-        "PID",
-        "set point",
-        "standard deviation",
-        "manipulated variable",
-    ):
-        assert part in shown
+    parts = ("Jacket temperature $T_E^*$", "$C_{A0}^*$", "agent", "PID", "set point", "standard deviation", "manipulated variable")
+    assert all(part in shown for part in parts)
 
 
-KINDS = [
-    pytest.param(kind, marks=pytest.mark.torture)
-    for kind in ("seeds", "curves", "tracking", "online", "budget", "mdp", "framework", "network")
-]
+def budget_figure() -> Figure:
+    rows = [(s, c, n, c + s + n / 500) for s in range(3) for c in (1, 2) for n in (500, 20, 100)]
+    budget = pd.DataFrame(rows, columns=["seed", "case", "episodes_per_epoch", "objective"])
+    levels = {"PID": 1.5, "offline policy": 1.2, "minimum variance on y": 5.0}
+    return figures.budget_figure(budget, {1: levels, 2: levels}, {1: "Case Study I", 2: "Case Study II"})
 
 
-@pytest.mark.parametrize("kind", ["control", *KINDS])
+KINDS = {
+    "control": lambda: draw(3),
+    "tracking": lambda: figures.tracking_figure(response(), OUTPUTS[:2], SET_POINTS[:2], WORDS),
+    "curves": lambda: figures.learning_curves(history(), {40: "policy kept"}, {"PID": 3.0}, {"paper": 0.1}),
+    "online": lambda: figures.learning_curves(history()[["epochs", "mean_return"]], {10: "second round"}, {"PID": 3.0}),
+    "seeds": lambda: draw(2, several(response(), ["mean"])),
+    "budget": budget_figure,
+    "mdp": drawings.mdp_figure,
+    "framework": drawings.framework_figure,
+    "network": lambda: drawings.network_figure((20, 20), 2, 2, 0.01),
+}
+
+
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=pytest.mark.torture if kind != "control" else ()) for kind in KINDS])
 def test_nothing_is_cut_off_and_no_panels_overlap(kind: str) -> None:
-    figure = {
-        "control": lambda: draw(3),
-        "tracking": lambda: figures.tracking_figure(response(), OUTPUTS[:2], SET_POINTS[:2], WORDS),
-        "curves": lambda: figures.learning_curves(history(), {40: "policy kept"}, {"PID": 3.0}, {"paper": 0.1}),
-        "online": lambda: figures.learning_curves(history()[["epochs", "mean_return"]], {10: "second round"}, {"PID": 3.0}),
-        "seeds": lambda: draw(2, several(response(), ["mean"])),
-        "budget": budget_figure,
-        "mdp": drawings.mdp_figure,
-        "framework": drawings.framework_figure,
-        "network": lambda: drawings.network_figure((20, 20), 2, 2, 0.01),
-    }[kind]()
+    figure = KINDS[kind]()
     figure.draw_without_rendering()
-    drawn, (width, height) = figure.get_tightbbox(), figure.get_size_inches()
-    assert drawn.x0 >= -0.01
-    assert drawn.y0 >= -0.01
-    assert drawn.x1 <= width + 0.01
-    assert drawn.y1 <= height + 0.01
+    drawn = figure.get_tightbbox()
+    assert (drawn.min >= -0.01).all()
+    assert (drawn.max <= figure.get_size_inches() + 0.01).all()
     panels = [axes.get_tightbbox() for axes in figure.axes] + [legend.get_window_extent() for legend in figure.legends]
     groups: list[Sequence[Bbox | None]] = [panels, *([text.get_window_extent() for text in axes.texts] for axes in figure.axes)]
     for group in groups:
         for one, other in combinations(group, 2):
-            assert one is not None
-            assert other is not None
             assert min(one.x1, other.x1) - max(one.x0, other.x0) < 1 or min(one.y1, other.y1) - max(one.y0, other.y0) < 1
 
 
 @pytest.mark.parametrize("n_loops", [2, 3])
 def test_tracking_figure_draws_the_first_interactions_of_the_controlled_variables(n_loops: int) -> None:
     table = response(n_loops)
-    figure = figures.tracking_figure(table, OUTPUTS[:n_loops], SET_POINTS[:n_loops], WORDS, n_samples=30)
+    figure = figures.tracking_figure(table, OUTPUTS[:n_loops], SET_POINTS[:n_loops], WORDS)
     assert len(figure.axes) == n_loops
     for axes, variable in zip(figure.axes, OUTPUTS, strict=False):
         lines = {line.get_label(): line for line in axes.lines}
@@ -249,8 +224,8 @@ def test_several_seeds_are_thin_lines_about_their_median() -> None:
     panel = next(axes for axes in figure.axes if axes.get_label() == "B T")
     (line,) = [line for line in panel.lines if line.get_label() == "controlled, agent"]
     np.testing.assert_allclose(curve(line)[:, 1], expected["mean"] + 1.5)
-    thin = {label: paths for label, paths in ((c.get_label(), c.get_paths()) for c in panel.collections) if label == figures.SINGLE}
-    assert len(thin[figures.SINGLE]) == 4
+    (*_, thin) = [collection for collection in panel.collections if collection.get_label() == figures.SINGLE]
+    assert len(thin.get_paths()) == 4
     summary = figures.drawn_summary(figure).query("panel == 'B T' and artist == @figures.SINGLE")
     assert len(summary) == 8  # of expert and agent
     assert np.isin(np.round(expected["mean"].max() + np.array([0.0, 1, 2, 10]), 9), summary["maximum"].round(9)).all()
@@ -283,16 +258,6 @@ def test_learning_curves_of_several_seeds_show_each_and_their_median() -> None:
     assert "each of 4 seeds" in texts(figure)
 
 
-def budget() -> pd.DataFrame:
-    rows = [(s, c, n, c + s + n / 500) for s in range(3) for c in (1, 2) for n in (500, 20, 100)]
-    return pd.DataFrame(rows, columns=["seed", "case", "episodes_per_epoch", "objective"])
-
-
-def budget_figure() -> Figure:
-    levels = {"PID": 1.5, "offline policy": 1.2, "minimum variance on y": 5.0}
-    return figures.budget_figure(budget(), {1: levels, 2: levels}, {1: "Case Study I", 2: "Case Study II"})
-
-
 def test_the_budget_curve_shows_median_seeds_and_references() -> None:
     figure = budget_figure()
     first, second = figure.axes
@@ -302,16 +267,8 @@ def test_the_budget_curve_shows_median_seeds_and_references() -> None:
         assert len(axes.collections[0].get_paths()) == 3
         assert axes.get_xscale() == "log"
     shown = texts(figure)
-    for part in (
-        "Case Study II",
-        "plant episodes per epoch",
-        "PID",
-        "offline policy",
-        "minimum variance",
-        "each of 3 seeds",
-        "500",
-    ):
-        assert part in shown
+    parts = ("Case Study II", "plant episodes per epoch", "PID", "offline policy", "minimum variance", "each of 3 seeds", "500")
+    assert all(part in shown for part in parts)
 
 
 def test_learning_curves_draw_return_gap_and_every_weight() -> None:
@@ -347,31 +304,21 @@ def test_learning_curves_draw_what_the_history_holds(columns: list[str]) -> None
 
 
 def test_the_drawings_name_what_they_show() -> None:
-    assert all(part in texts(drawings.mdp_figure()) for part in ("Controller", "Process", "u_t", "x_t", "y_{t+1}", "R_{t+1}"))
-    framework = texts(drawings.framework_figure())
-    for part in ("Offline", "Online", "Process data", "MaxEnt IRL", "REINFORCE", r"\alpha^*", "real objective", "new set point"):
-        assert part in framework
-    network = texts(drawings.network_figure((12, 34, 56), 3, 5, 0.02))
-    for part in (
-        "layer 3",
-        "12 cells",
-        "34 cells",
-        "56 cells",
-        "56 → 10",
-        "slope 0.02",
-        "ReLU6",
-        "(3)",
-        "(5)",
-        r"\sigma_t",
-        "u_{max}",
-    ):
-        assert part in network
+    drawn = {
+        "Controller|Process|u_t|x_t|y_{t+1}|R_{t+1}": drawings.mdp_figure(),
+        r"Offline|Online|Process data|MaxEnt IRL|REINFORCE|\alpha^*|real objective|new set point": drawings.framework_figure(),
+        r"layer 3|12 cells|34 cells|56 cells|56 → 10|slope 0.02|ReLU6|(3)|(5)|\sigma_t|u_{max}": drawings.network_figure(
+            (12, 34, 56), 3, 5, 0.02
+        ),
+    }
+    for parts, figure in drawn.items():
+        assert all(part in texts(figure) for part in parts.split("|"))
 
 
 def test_drawn_summary_reads_back_what_was_drawn() -> None:
     table = response()
     summary = figures.drawn_summary(draw(2, table)).set_index(["panel", "artist"])
-    mean = rows_of(table, "agent", "T")["mean"].to_numpy()
+    mean, std = rows_of(table, "agent", "T")[["mean", "std"]].to_numpy().T
     row = summary.loc[("B T", "controlled, agent")]
     assert row["points"] == N_STEPS + 1
     assert (row["from"], row["to"]) == (0, N_STEPS)
@@ -379,24 +326,11 @@ def test_drawn_summary_reads_back_what_was_drawn() -> None:
         [mean[0], mean.min(), mean.max(), mean.mean(), mean[-1]]
     )
     assert summary.loc[("D T zoom", "set point"), "mean"] == 4.0
+    band = summary.loc[("B T", f"controlled, agent: {figures.BAND}")]
+    assert band[["minimum", "maximum"]].tolist() == pytest.approx([(mean - std).min(), (mean + std).max()])
     bands = [label for _, label in summary.index if "standard deviation" in label]
     assert len(bands) == 8
     assert len(summary) == 12 + 8 + 4
-
-
-@pytest.mark.parametrize(
-    ("variable", "column"),
-    [("T", "mean"), ("C_A0", "std")]
-    + [pytest.param(variable, "mean", marks=pytest.mark.torture) for variable in ("C_A", "C_A0", "T_E")]
-    + [pytest.param(variable, "std", marks=pytest.mark.torture) for variable in ("C_A", "T", "T_E")],
-)
-def test_drawn_summary_notices_a_change_of_one_percent(column: str, variable: str) -> None:
-    table = response()
-    before = figures.drawn_summary(draw(2, table)).select_dtypes("number")
-    changed = table.copy()
-    changed.loc[(changed["variable"] == variable) & (changed["controller"] == "agent"), column] *= 1.01
-    after = figures.drawn_summary(draw(2, changed)).select_dtypes("number")
-    assert not np.allclose(before, after, rtol=1e-5)
 
 
 def test_style_does_not_change_what_was_drawn() -> None:

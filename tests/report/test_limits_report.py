@@ -4,11 +4,9 @@ from types import SimpleNamespace
 
 import pandas as pd
 import pytest
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from helpers.report import limits_findings, limits_report, typesetting
 from helpers.report.collection import LIMITS
-from helpers.report.tables import to_markdown
 from helpers.runs.artifacts import load_stage, save_stage
 from helpers.runs.sources import PROJECT
 from helpers.settings.paper import load
@@ -31,13 +29,8 @@ def results(root, tmp_path):
 
 def write(folder, level):
     """What notebook 06 writes, in small: the gap of the MPC and every other number follow from `level`."""
-    known = {
-        "minimum_variance": 18.0,
-        "minimum_variance_filtered": 18.5,
-        "minimum_variance_x": 19.8,
-        "dynamic_programme_filtered": 19.0,
-    }
-    objectives = {"expert": 10.0, "mpc": 19.0, "irl_reinforce": level, "dynamic_programme": 20.0} | known
+    objectives = {"expert": 10.0, "mpc": 19.0, "irl_reinforce": level, "dynamic_programme": 20.0, "minimum_variance": 18.0}
+    objectives |= {"minimum_variance_filtered": 18.5, "minimum_variance_x": 19.8, "dynamic_programme_filtered": 19.0}
     gaps = pd.DataFrame({"beta": 30.0, "controller": list(objectives), "objective": list(objectives.values())})
     below = gaps["controller"].map({"mpc": level, "irl_reinforce": 8.0}).fillna(100 * (1 - gaps["objective"] / 20))
     gaps = gaps.assign(gap=below, gap_low=below - 1, gap_high=below + 1, low=gaps["objective"] - 0.1, high=gaps["objective"] + 0.1)
@@ -133,11 +126,6 @@ def test_the_papers_way_beside_its_rivals(results):
     assert limits_findings.standings(results(5)) == {0: {"ppo": {"ahead": [1, 2]}}, 500: {"ppo": {"ahead": [1, 2]}}}
 
 
-def test_the_plants_that_were_improved_on(results):
-    improved = limits_report.tabulate(results(1))["limits_improved"].set_index(["case", "controller"])
-    assert improved.loc[("II", "improved on that plant"), "A x 1.3, B x 0.7"] == "20.0"
-
-
 def test_where_improving_on_the_plant_beats_who_does_not_know_it(results):
     """It reaches 10 to 14 in Case I and 20 to 24 in Case II; minimum variance has 15 there, the MPC of the grid 18."""
     assert limits_findings.there(results(4)) == {}  # too few for an interval
@@ -154,11 +142,24 @@ def test_plants_that_cannot_hold_the_set_point_are_left_out(results):
     assert (kept[1, "online"], kept[2, "online"]) == (50.0, 80.0)
 
 
-def test_what_is_attainable(results):
+def test_what_one_seed_says(results):
     run = results(1)
-    assert limits_findings.seeds(run) == {1: 1, 2: 1}
-    assert limits_findings.attainable(run)[2] == pytest.approx({"look_ahead": 1.0, "noise": 5.0, "filter": 2.5})
-    assert limits_findings.agreement(run) == pytest.approx(0.2)  # of the last grid only
+    found = limits_findings.find(run)
+    assert found["seeds"] == {1: 1, 2: 1}
+    assert found["attainable"][2] == pytest.approx({"look_ahead": 1.0, "noise": 5.0, "filter": 2.5})
+    assert found["agreement"] == pytest.approx(0.2)  # of the last grid only
+    assert found["practice"] == {
+        "model_ahead": [1],  # 18 against 12 and 22
+        "never_below": ["offset-free MPC"],
+        "least": (40.0, 40.0),
+        "without_model": {500: {"PPO from scratch": [1, 2]}},
+    }
+    assert found["not_found"] == {case: ["PPO from scratch ($C_A^*$)"] for case in (1, 2)}  # loops that it never found
+    ranges = "A and B times 1 to 2 and 0.7 to 1; the set points of the two loops times 1.25 to 1.25 and 1 to 1"
+    assert found["ranges"] == ranges
+    assert (found["price"][1]["worse"], found["price"][2]["model"]) == (50.0, 80.0)
+    improved = limits_report.tabulate(run)["limits_improved"].set_index(["case", "controller"])
+    assert improved.loc[("II", "improved on that plant"), "A x 1.3, B x 0.7"] == "20.0"
 
 
 def test_what_the_searches_for_gains_came_to(results):
@@ -166,30 +167,6 @@ def test_what_the_searches_for_gains_came_to(results):
     found = limits_findings.tuned(results(3))
     assert found[1] == {"better": 0, "seeds": 3, "least": 5.0, "greatest": 6.0}
     assert found[2] == {"better": 1, "seeds": 3, "least": 10.0, "greatest": 11.0}
-
-
-def test_what_helps_to_choose(results):
-    found = limits_findings.practice(results(1))
-    assert found["model_ahead"] == [1]  # 18 against 12 and 22
-    assert found["never_below"] == ["offset-free MPC"]
-    assert found["least"] == (40.0, 40.0)
-    assert found["without_model"] == {500: {"PPO from scratch": [1, 2]}}
-
-
-def test_loops_that_a_learner_never_found(results):
-    assert limits_findings.not_found(results(1)) == {case: ["PPO from scratch ($C_A^*$)"] for case in (1, 2)}
-
-
-def test_the_ranges_of_the_grids(results):
-    assert limits_findings.ranges(results(1)) == (
-        "A and B times 1 to 2 and 0.7 to 1; the set points of the two loops times 1.25 to 1.25 and 1 to 1"
-    )
-
-
-def test_the_price_of_improving(results):
-    found = limits_findings.price(results(1))
-    assert found[1]["worse"] == 50.0
-    assert found[2]["model"] == 80.0
 
 
 def test_what_needs_no_plant(results):
@@ -215,23 +192,14 @@ def test_the_section_of_the_template(results):
     text = (PROJECT / "reports/template/report.md.jinja").read_text(encoding="utf-8")
     start, end = text.index("## Which controller to take"), text.index("{% if one_policy | length %}\n\n## One policy")
     section = text[text.index("{% from") : text.index("{% set beta")] + "{% if limits %}" + text[start:end]
-    loader = FileSystemLoader(typesetting.TEMPLATE)
-    marks = {"comment_start_string": "{##", "comment_end_string": "##}"}
-    environment = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, **marks)
-    environment.filters |= {"table": to_markdown, "numeral": lambda case: "I" * case}
-    run = results(1)
+    template, run = typesetting.environment().from_string(section), results(1)
     found = limits_findings.find(run) | {"there": {"A x 1.3, B x 0.7": {1: ["offset-free MPC"], 2: []}}}
     shown = {"tables": limits_report.tabulate(run), "limits": found, "n_seeds": 1, "level_words": "95 %", "appendix": None}
-    shown |= {
-        "heat_maps": ["model_case_1", "set_point_case_2"],
-        "grids": {"model": "m", "set_point": "s"},
-        "rivals": {},
-        "one_policy": (),
-    }
-    rendered = typesetting.numbered(environment.from_string(section).render(shown))
+    shown |= {"heat_maps": ["model_case_1", "set_point_case_2"], "grids": {"model": "m", "set_point": "s"}}
+    rendered = typesetting.numbered(template.render(shown, rivals={}, one_policy=()))
     assert "10.0 [9.0, 11.0]" in rendered
     assert "](figures/limits_budget.svg)" in rendered
     assert "lies\n  above every learner after its last one in Case Study I (" in rendered
     assert "- all but offset-free MPC on A x 1.3, B x 0.7 in Case Study I;\n- all controllers on" in rendered
     assert "in Case Study II (where no input within the bounds holds the set point)." in rendered
-    assert environment.from_string(section).render(limits={}).strip() == ""
+    assert template.render(limits={}).strip() == ""

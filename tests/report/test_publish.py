@@ -11,14 +11,8 @@ from helpers.report.publish import PublishError, check, relinked
 from helpers.runs.sources import PROJECT
 
 REVISION = "0123abcd" * 5
-GOOD = {
-    "scale": "paper",
-    "revision": REVISION,
-    "revisions_of_stages": [REVISION],
-    "seeds": [0, 1],
-    "missing_seeds": [],
-    "stage_seconds": 7200,
-}
+GOOD = {"scale": "paper", "revision": REVISION, "revisions_of_stages": [REVISION], "seeds": [0, 1], "missing_seeds": []}
+GOOD |= {"stage_seconds": 7200}
 OTHER = "f" * 40
 
 
@@ -27,18 +21,14 @@ def test_a_clean_run_at_paper_scale_is_accepted(reference):
     check(GOOD, reference, REVISION)
 
 
+CHANGED = REVISION + "+changes"
 REFUSED = {
     "smoke scale": ({"scale": "smoke"}, None, REVISION, "smoke scale"),
     "fewer seeds": ({}, {"seeds": [0, 1, 2]}, REVISION, "2 seeds, the published one 3"),
-    "changed code now": ({}, None, REVISION + "+changes", "commit"),
-    "changed code then": ({"revision": REVISION + "+changes"}, None, REVISION, "+changes"),
-    "changed code all along": (
-        {"revision": REVISION + "+changes", "revisions_of_stages": [REVISION + "+changes"]},
-        None,
-        REVISION + "+changes",
-        "+changes",
-    ),
-    "one stage of changed code": ({"revisions_of_stages": [REVISION, REVISION + "+changes"]}, None, REVISION, "+changes"),
+    "changed code now": ({}, None, CHANGED, "commit"),
+    "changed code then": ({"revision": CHANGED}, None, REVISION, "+changes"),
+    "changed code all along": ({"revision": CHANGED, "revisions_of_stages": [CHANGED]}, None, CHANGED, "+changes"),
+    "one stage of changed code": ({"revisions_of_stages": [REVISION, CHANGED]}, None, REVISION, "+changes"),
     "a report of another commit": ({"revision": OTHER}, None, REVISION, OTHER),
     "seeds that failed": ({"missing_seeds": [3, 7]}, None, REVISION, "lacks the seeds 3, 7"),
     "another commit now": ({}, None, OTHER, OTHER),
@@ -113,17 +103,9 @@ def test_publishing_copies_the_report_and_the_executed_notebooks_of_the_first_se
     assert publish.main([]) == 0
     reference = project / "reports/reference"
     found = {str(path.relative_to(reference)) for path in reference.rglob("*") if path.is_file()}
+    of_the_report = (path for path in (project / "reports/latest").rglob("*") if path.is_file())
     assert found == {
-        *(
-            "report.html",
-            "report.pdf",
-            "report.md",
-            "figures/figure_3.png",
-            "tables/table_2.csv",
-            "tables/time.csv",
-            "tables/gaps.csv",
-        ),
-        *("comparison.csv", "seeds.csv", "provenance.json", "notebooks/05_report.ipynb"),
+        *(str(path.relative_to(project / "reports/latest")) for path in of_the_report),
         *("notebooks/02_offline_irl_case_1.ipynb", "notebooks/02_offline_irl_printed_case_1.ipynb"),
         *("notebooks/01_demonstrations_case_3.ipynb", "reliability.md"),
     }
@@ -179,56 +161,40 @@ def refused(capsys, status):
     return said
 
 
-@pytest.mark.parametrize("fault", ["no report", "smoke", "no marks in README"])
-def test_a_refused_run_changes_nothing(published, capsys, fault):
+COPY, LATEST = "results/paper/seed_0/case_1/notebooks/02_offline_irl_printed", "reports/latest"
+FAULTS = {  # what is written, None for a file that is missing; the exit status, and what is said
+    "no report": (f"{LATEST}/provenance.json", None, 2, "there is no report"),
+    "smoke": (f"{LATEST}/provenance.json", json.dumps(GOOD | {"scale": "smoke"}), 2, "only paper scale is published"),
+    "no marks in README": ("README.md", "no marks", 2, "the marks of the block 'glance' must stand on one page, not on 0"),
+    "a failed copy": (f"{COPY}.failed", "ZeroDivisionError", 2, f"{COPY}.ipynb: failed when it was run last"),
+    "a failed report": (f"{LATEST}/notebooks/05_report.failed", "x", 2, "05_report.ipynb: failed when it was run last"),
+    "no claims": ("reports/reference/tables/claims.csv", "", 2, "lacks tables/claims.csv, which the published one has"),
+    "no limits": ("reports/reference/tables/limits_gaps.csv", "", 2, "lacks tables/limits_gaps.csv, which the published one has"),
+    **{
+        f"no {part}": (f"{LATEST}/{part}", None, 1, f"{LATEST}/{part}: could not be published: No such file")
+        for part in ("figures", "seeds.csv", "tables/time.csv", "notebooks/05_report.ipynb")
+    },
+}
+
+
+@pytest.mark.parametrize(("path", "text", "status", "says"), FAULTS.values(), ids=FAULTS)
+def test_a_run_that_is_refused_or_lacks_a_part_ends_in_a_sentence_and_changes_nothing(published, capsys, path, text, status, says):
     project, content = published
-    provenance = project / "reports/latest/provenance.json"
-    if fault == "no report":
-        provenance.unlink()
-    elif fault == "smoke":
-        provenance.write_text(json.dumps(GOOD | {"scale": "smoke"}))
+    if text is None:
+        (project / path).rename(project / "elsewhere")
     else:
-        (project / "README.md").write_text("no marks")
+        (project / path).write_text(text)
     before = content()
-    refused(capsys, 2)
+    assert says in refused(capsys, status)
     assert content() == before
-
-
-@pytest.mark.parametrize(
-    ("copy", "mark"),
-    [
-        ("results/paper/seed_0/case_1/notebooks/02_offline_irl_printed.ipynb", "02_offline_irl_printed.failed"),
-        ("reports/latest/notebooks/05_report.ipynb", "05_report.failed"),
-    ],
-)
-def test_a_copy_of_a_notebook_that_failed_is_not_published(published, capsys, copy, mark):
-    project, content = published
-    (project / copy).with_name(mark).write_text("02_offline_irl: ZeroDivisionError")
-    before = content()
-    assert f"{project / copy}: failed when it was run last" in refused(capsys, 2)
-    assert content() == before
+    assert sorted(found.name for found in (project / "reports").iterdir()) == ["latest", "reference"]
 
 
 @pytest.mark.parametrize("table", ["claims.csv", "limits_gaps.csv"])
-def test_a_report_without_the_evidence_of_the_published_one_does_not_replace_it(published, capsys, table):
-    project, content = published
-    (project / "reports/reference/tables" / table).touch()
-    before = content()
-    assert f"the run lacks tables/{table}, which the published one has" in refused(capsys, 2)
-    assert content() == before
-    (project / "reports/latest/tables" / table).write_text('controller,"I, $\\beta$ = 30"\n')
+def test_a_report_with_the_evidence_of_the_published_one_replaces_it(published, table):
+    for folder in ("reference", "latest"):
+        (published[0] / "reports" / folder / "tables" / table).write_text('controller,"I, $\\beta$ = 30"\n')
     assert publish.main([]) == 0
-
-
-@pytest.mark.parametrize("part", ["figures", "seeds.csv", "tables/time.csv", "notebooks/05_report.ipynb"])
-def test_a_report_that_lacks_a_part_ends_in_a_sentence_and_changes_nothing(published, capsys, part):
-    project, content = published
-    path = project / "reports/latest" / part
-    path.rename(project / "elsewhere")
-    before = content()
-    assert f"{path}: could not be published: No such file" in refused(capsys, 1)
-    assert content() == before
-    assert sorted(found.name for found in (project / "reports").iterdir()) == ["latest", "reference"]
 
 
 def test_a_folder_that_cannot_be_copied_ends_in_a_sentence(published, capsys):

@@ -67,16 +67,19 @@ def test_the_verdict_and_its_reason(published, low, high, expected, reason):
     assert scorecard.verdict("policy", published, 20, low, high) == (expected, reason)
 
 
-def test_the_expert_is_fitted_whatever_its_interval_says():
-    assert scorecard.verdict("expert", 10.0, 20, 9.0, 9.6) == ("fitted", "0.4 above the interval")
-    assert scorecard.verdict("expert", 10.0, 20, 0.0, 20.0) == ("fitted", "inside 0.00 to 20.00")
-    assert scorecard.verdict("expert", 10.0, 1, np.nan, np.nan) == ("fitted", "one seed")
-
-
-def test_one_seed_cannot_tell():
-    assert scorecard.verdict("policy", 10.0, 1, np.nan, np.nan) == ("cannot tell", "one seed")
-    assert scorecard.verdict("alpha", 10.0, 0, np.nan, np.nan) == ("cannot tell", "no seed gave it")
-    assert scorecard.verdict("alpha", 0.5, 2, 0.4, 0.501)[1] == "inside 0.400 to 0.501"
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (("expert", 10.0, 20, 9.0, 9.6), ("fitted", "0.4 above the interval")),  # whatever its interval says
+        (("expert", 10.0, 20, 0.0, 20.0), ("fitted", "inside 0.00 to 20.00")),
+        (("expert", 10.0, 1, np.nan, np.nan), ("fitted", "one seed")),
+        (("policy", 10.0, 1, np.nan, np.nan), ("cannot tell", "one seed")),
+        (("alpha", 10.0, 0, np.nan, np.nan), ("cannot tell", "no seed gave it")),
+        (("alpha", 0.5, 2, 0.4, 0.501), ("match", "inside 0.400 to 0.501")),
+    ],
+)
+def test_the_expert_is_fitted_and_one_seed_cannot_tell(given, expected):
+    assert scorecard.verdict(*given) == expected
 
 
 # Medians and intervals -----------------------------------------------------------------------------------------------
@@ -128,16 +131,14 @@ def test_the_sampling_error_that_ours_lack_is_added_to_features_only():
 
 def test_another_sampling_error_may_change_a_verdict():
     """The policy's h-III is printed 0.5 below ours: beyond 1.96 x 0.13 (its own error), within 1.96 x 0.3 (that of the fit)."""
-    names = ["h-I", "h-III"]
-    printed = {4: PublishedCase(table=9, expert=(10.0, -2.0), policy=(11.0, -2.5), alpha=(0.6, -0.8))}
-    runs = seeds()
+    names, runs = ["h-I", "h-III"], seeds()
     runs["metric"] = runs["metric"].str.replace("h-II", "h-III")
     prediction = pd.DataFrame(
         {"table": [9, 9, 8], "feature": ["h-III", "h-I", "h-III"], "published": -2.0, "simulated": -1.7, "deviation": 1.0}
     )
-    errors = scorecard.sampling_errors(prediction, printed)
+    errors = scorecard.sampling_errors(prediction, SMALL)
     assert errors == {(4, "h-III"): pytest.approx(0.3)}
-    ours, wider = (scorecard.comparison(printed, runs, scorecard.summary(runs), names, MEASURED, found) for found in (None, errors))
+    ours, wider = (scorecard.comparison(SMALL, runs, scorecard.summary(runs), names, MEASURED, found) for found in (None, errors))
     found = scorecard.changed(ours, wider)
     assert found[["row", "feature", "verdict", "verdict_with_the_wider_error"]].to_numpy().tolist() == [
         ["policy", "h-III", "differs", "match"]
@@ -157,12 +158,9 @@ def test_comparison_has_a_row_for_each_published_number_even_if_nobody_reproduce
     table = compare(seeds().query("case == 1"), published, FEATURES)
     assert len(table) == 54
     assert table[["reproduced", "ci_low", "pred_high"]].isna().all(axis=None)
-    assert (table["n_seeds"] == 0).all()
+    assert set(table["n_seeds"]) == {0}
     assert set(table["verdict"]) == {"fitted", "cannot tell"}
     assert set(table["reason"]) == {"no seed gave it"}
-    assert not table.duplicated(["table", "case", "row", "feature"]).any()
-    assert table.query("table == 3 and row == 'alpha' and feature == 'T-III'")["published"].tolist() == [-0.545]
-    assert table.query("case == 3 and row == 'policy' and feature == 'C_A-II'")["published"].tolist() == [9.37]
 
 
 def with_ratios(runs: pd.DataFrame, published=None, names=None) -> pd.DataFrame:
@@ -216,23 +214,12 @@ def test_features_that_differ_and_lie_nearer_to_the_printed_expert_are_counted()
 
 
 def test_settings_fitted_to_one_table_predict_the_other():
-    columns = ["fitted_on", "table", "deviation", "relative_error"]
-    prediction = pd.DataFrame(
-        [
-            ["Table 2 and 4", 2, 1.0, 0.01],
-            ["Table 2 and 4", 2, -3.0, -0.03],
-            ["Table 2", 2, 0.5, 0.01],
-            ["Table 2", 4, 2.0, -0.04],
-            ["parameter files", 4, 2.0, 0.02],
-        ],
-        columns=columns,
-    )
-    found = scorecard.held_out(prediction)
+    rows = [("Table 2 and 4", 2, 1.0, 0.01), ("Table 2 and 4", 2, -3.0, -0.03), ("Table 2", 2, 0.5, 0.01)]
+    rows += [("Table 2", 4, 2.0, -0.04), ("parameter files", 4, 2.0, 0.02)]
+    found = scorecard.held_out(pd.DataFrame(rows, columns=["fitted_on", "table", "deviation", "relative_error"]))
     assert found["role"].tolist() == ["fit", "fit", "prediction", "fit"]
-    first = found.iloc[0]
-    assert first["mean_error, %"] == pytest.approx(2.0)
-    assert first["greatest_error, %"] == pytest.approx(3.0)
-    assert first["greatest_deviation"] == 3.0
+    numbers = found.loc[0, ["mean_error, %", "greatest_error, %", "greatest_deviation"]]
+    assert numbers.tolist() == pytest.approx([2.0, 3.0, 3.0])
 
 
 def test_trials_are_compared_with_the_headline_on_their_seeds():
@@ -246,22 +233,17 @@ def test_trials_are_compared_with_the_headline_on_their_seeds():
 
 
 def test_claims_are_put_together_over_cases_and_quantities():
+    said = {  # by claim and case, of each quantity
+        "a": {1: ["holds"], 2: ["holds"]},
+        "b": {1: ["holds"], 2: ["does not hold"]},
+        "c": {1: ["does not hold"], 3: ["cannot tell"]},
+        "d": {1: ["holds", "cannot tell"]},
+        "e": {1: ["not comparable"]},
+        "f": {2: ["does not hold", "holds"]},
+        "g": {3: ["holds", *["does not hold"] * 3]},
+    }
     rows = [
-        ("a", 1, "x", "holds"),
-        ("a", 2, "x", "holds"),
-        ("b", 1, "x", "holds"),
-        ("b", 2, "x", "does not hold"),
-        ("c", 1, "x", "does not hold"),
-        ("c", 3, "x", "cannot tell"),
-        ("d", 1, "x", "holds"),
-        ("d", 1, "y", "cannot tell"),
-        ("e", 1, "", "not comparable"),
-        ("f", 2, "x", "does not hold"),
-        ("f", 2, "y", "holds"),
-        ("g", 3, "w", "holds"),
-        ("g", 3, "x", "does not hold"),
-        ("g", 3, "y", "does not hold"),
-        ("g", 3, "z", "does not hold"),
+        (name, case, f"{i}", word) for name, cases in said.items() for case, words in cases.items() for i, word in enumerate(words)
     ]
     claims = pd.DataFrame(rows, columns=["id", "case", "quantity", "verdict"]).assign(section="5.1")
     claims["statement"] = "the claim " + claims["id"]

@@ -7,12 +7,10 @@ import pandas as pd
 import pytest
 
 from helpers.report import tables
-from helpers.settings.paper import load, load_published
+from helpers.settings.paper import load
 
 PARAMS = Path(__file__).resolve().parents[2] / "params"
-FEATURES = ["C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III"]
 TWO = ["h-I", "h-II"]
-NUMBERS = ["reproduced", "ci_low", "ci_high", "pred_low", "pred_high"]
 
 
 @pytest.mark.parametrize(
@@ -200,22 +198,6 @@ def test_columns_of_numbers_and_intervals_stand_to_the_right() -> None:
     assert [cell.endswith(":") for cell in rule] == [True, True, True, False, False]
 
 
-def printed(case: int) -> pd.DataFrame:
-    """A comparison that reproduces the paper's rows themselves."""
-    rows = [
-        {"row": row, "feature": name, "published": value, "verdict": "match", **dict.fromkeys(NUMBERS, value)}
-        for row in ("expert", "policy", "alpha")
-        for name, value in zip(FEATURES, getattr(load_published(PARAMS)[case], row), strict=True)
-    ]
-    return pd.DataFrame(rows)
-
-
-def test_the_printed_rows_come_out_as_printed() -> None:
-    shown = cells(tables.to_markdown(tables.results_table(printed(1), FEATURES)))
-    assert shown[2][2:] == ["21.63", "20.68", "4.08", "7.93", "-22.87", "-22.43"]
-    assert shown[10][2:] == ["0.137", "0.652", "-0.067", "-0.630", "-0.194", "-0.343"]
-
-
 def test_markdown_text_is_typeset_or_escaped() -> None:
     frame = pd.DataFrame({"C_A-I": ["alpha*", None, "|e| before", "T-II", "a * b <c> $x|y$", "x = 2"], "flag": [True, False] * 3})
     lines = tables.to_markdown(frame, labels={"flag": "Is it so?"}).splitlines()
@@ -226,18 +208,6 @@ def test_markdown_text_is_typeset_or_escaped() -> None:
     ):
         assert line.startswith(f"| {expected} ")
     assert [row[-1] for row in cells("\n".join(lines[2:]))] == ["yes", "no"] * 3
-
-
-def test_markdown_becomes_a_table_with_maths_in_html() -> None:
-    pypandoc = pytest.importorskip("pypandoc")
-    rows = printed(1)
-    rows.loc[rows["feature"] == "T-I", "reproduced"] = np.nan
-    table = tables.results_table(rows, FEATURES)
-    html = pypandoc.convert_text(tables.to_markdown(table), "html", format="markdown", extra_args=["--mathml"])
-    assert html.count("<tr") == 13
-    assert html.count("<math") == 6 + 12
-    assert "–" in html
-    assert "-0.067" in html.replace("−", "-")
 
 
 def test_an_empty_table_is_a_header() -> None:

@@ -43,19 +43,10 @@ def test_every_published_number_is_in_the_picture_with_ours_relative_to_it():
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["match", "differs", "cannot tell", "fitted"]
 
 
-def test_one_seed_has_points_without_intervals():
-    one = compared((1,)).assign(pred_low=np.nan, pred_high=np.nan)
-    verdict_figures.comparison_figure(one).draw_without_rendering()
-
-
 def test_the_weights_are_drawn_while_they_are_learned_and_beside_the_printed_ones():
     epochs = np.arange(1, 21)
-    history = pd.concat(
-        [
-            pd.DataFrame({"epochs": epochs, "seed": seed} | {f"alpha:{name}": 0.1 * seed + 0 * epochs for name in NAMES})
-            for seed in range(3)
-        ]
-    )
+    runs = [{"epochs": epochs, "seed": seed} | dict.fromkeys((f"alpha:{name}" for name in NAMES), 0.1 * seed) for seed in range(3)]
+    history = pd.concat(map(pd.DataFrame, runs))
     figure = verdict_figures.weights_figure(history, compared((1,)))
     first, second, last = figure.axes
     assert [axes.get_label() for axes in figure.axes] == ["A C_A", "B T", "printed"]

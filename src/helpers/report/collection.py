@@ -1,6 +1,7 @@
 """What the stages of all cases and seeds wrote, read and checked, for the report."""
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +19,7 @@ from helpers.settings.paper import HEADLINE, Params, PublishedCase, load, load_p
 DEMONSTRATIONS, ONLINE, BUDGET, EXPERIMENTS = "demonstrations", f"online_{HEADLINE}", "online_budget", "experiments"
 OFFLINE = {"offline": HEADLINE, "offline_printed": "printed"}  # stage in seeds.csv and the variant behind it
 REPORT = "05_report"
+SCORES = ("stage", "metric", "value")  # columns of scores.csv
 INFERRED = "inferred_settings"  # which has no case, and stands with the first seed
 LIMITS = ("attainable", "budget", "quality", "robustness", "safety")  # the parts of notebook 06, the last one written last
 ONE_POLICY, OWN_PLANT = "one_policy", "own_process"  # of notebooks 09 and 07, which are for no case and stand with the first
@@ -77,27 +79,34 @@ class Results:
         """Every number over its seeds, `scorecard.summary`."""
         return scorecard.summary(self.seeds)
 
+    @cached_property
+    def numbers(self) -> pd.DataFrame:
+        """The medians by case, stage and metric."""
+        return self.medians.set_index(scorecard.KEYS)
+
     def median(self, case: int, stage: str, metric: str) -> float:
         """The median of one number over the seeds; nan where no seed gave it."""
-        return self._by_number.get((case, stage, metric), float("nan"))
-
-    @cached_property
-    def _by_number(self) -> dict[tuple[int, str, str], float]:
-        found: dict[tuple[int, str, str], float] = self.medians.set_index(scorecard.KEYS)["median"].to_dict()
-        return found
-
-    def offline_folder(self, case: int, variant: str = HEADLINE) -> str:
-        """The folder of a case's offline learning."""
-        return _offline_folder(self.params[case], variant)
+        return float(self.numbers["median"].get((case, stage, metric), float("nan")))
 
     def table(self, case: int, folder: str, name: str) -> pd.DataFrame:
         """One table of one stage, that of every seed below the other, with a column `seed`."""
-        found = {seed: stage for (number, seed, stage_name), stage in self.stages.items() if (number, stage_name) == (case, folder)}
-        return pd.concat([stage.table(name).assign(seed=seed) for seed, stage in found.items()], ignore_index=True)
+        return stacked({place[:2]: stage for place, stage in self.stages.items() if (place[0], place[2]) == (case, folder)}, name)
 
 
-def _offline_folder(params: Params, variant: str) -> str:
+def offline_folder(params: Params, variant: str = HEADLINE) -> str:
+    """The folder of a case's offline learning."""
     return f"offline_{variant}" if params.case.offline.transfer_from is None else f"transfer_{variant}"
+
+
+def stacked(stages: Mapping[tuple[int, int], Stage], name: str, columns: tuple[str, ...] = ()) -> pd.DataFrame:
+    """One table of several stages, with columns case and seed, a case of its own before that of the stage; empty without any.
+
+    Args:
+        columns: those that the table must have.
+    """
+    tables = {place: stage.table(name, columns) for place, stage in stages.items()}
+    frames = [table.assign(case=table.get("case", case), seed=seed) for (case, seed), table in tables.items()]
+    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
 
 
 def collect(
@@ -122,30 +131,36 @@ def collect(
         seeds_found = whole or seeds_found  # without any, the first file that is missing is named below
     stages: dict[tuple[int, int, str], Stage] = {}
     frames = []
-    for case in cases:
-        for seed in seeds_found:
-            for folder, stage_names in names[case].items():
-                notebook = MADE_BY[folder.split("_")[0]]
-                path = root / scale / f"seed_{seed}" / f"case_{case}" / folder
-                stage = load_stage(path, f"notebook {notebook} for case {case} and seed {seed}")
-                stages[case, seed, folder] = stage
-                scores = stage.table("scores.csv", ("stage", "metric", "value"))
-                frames.append(scores.assign(case=case, seed=seed, stage=scores["stage"].map(stage_names)).dropna(subset="stage"))
-    seeds = pd.concat(frames, ignore_index=True)[["case", "seed", "stage", "metric", "value"]]
+    for case, seed in itertools.product(cases, seeds_found):
+        for folder, stage_names in names[case].items():
+            made_by = f"notebook {MADE_BY[folder.split('_')[0]]} for case {case} and seed {seed}"
+            stage = stages[case, seed, folder] = load_stage(root / scale / f"seed_{seed}" / f"case_{case}" / folder, made_by)
+            scores = stacked({(case, seed): stage}, "scores.csv", SCORES)
+            frames.append(scores.assign(stage=scores["stage"].map(stage_names)).dropna(subset="stage"))
+    seeds = pd.concat(frames, ignore_index=True)[["case", "seed", *SCORES]]
     features = feature_names(next(iter(params.values())).process.controlled)
     seeds = pd.concat([seeds, scorecard.relative(seeds, published, features)], ignore_index=True)
-    experiments = _finished(root / scale, cases, seeds_found, EXPERIMENTS, "notebook 08")
-    budget = _finished(root / scale, cases, seeds_found, BUDGET, "the online budget")
+
+    def optional(folder: str, made_by: str, of_cases: tuple[int, ...] = cases) -> dict[tuple[int, int], Stage]:
+        """A stage by case and seed, where it was run."""
+        places = itertools.product(of_cases, seeds_found)
+        paths = {(case, seed): root / scale / f"seed_{seed}" / f"case_{case}" / folder for case, seed in places}
+        return {place: load_stage(path, made_by) for place, path in paths.items() if (path / RECORD).is_file()}
+
+    experiments, budget = optional(EXPERIMENTS, "notebook 08"), optional(BUDGET, "the online budget")
+    one_policy, own_plant = optional(ONE_POLICY, "notebook 09", (1,)), optional(OWN_PLANT, "notebook 07", (1,))
     trials = {
-        (case, name): _finished(root / scale, (case,), seeds_found, _offline_folder(record, name), f"the trial '{name}'")
+        (case, name): optional(offline_folder(record, name), f"the trial '{name}'", (case,))
         for case, record in params.items()
         for name in record.trials
     }
+    limits = {
+        (*place, part): load_stage(last.folder.with_name(f"limits_{part}"), "notebook 06")
+        for place, last in optional(f"limits_{LIMITS[-1]}", "notebook 06").items()
+        for part in LIMITS
+    }
     path = root / scale / "seed_0" / INFERRED
     inferred = load_stage(path, "notebook 00") if (path / RECORD).is_file() else None
-    limits = _limits(root / scale, cases, seeds_found)
-    one_policy = _finished(root / scale, (1,), seeds_found, ONE_POLICY, "notebook 09")
-    own_plant = _finished(root / scale, (1,), seeds_found, OWN_PLANT, "notebook 07")
     parts: tuple[Mapping[Any, Stage], ...] = (one_policy, own_plant, experiments, budget, *trials.values(), limits)
     beyond = (*(stage for part in parts for stage in part.values()), *([inferred] if inferred else []))
     check([*stages.values(), *beyond], root / scale, params_root)
@@ -159,12 +174,12 @@ def collect(
         seeds=seeds,
         claims=claims.verdicts(known, claim_values),
         claim_values=claim_values,
-        budget=_budget(budget),
+        budget=stacked(budget, "scores.csv", ("episodes_per_epoch", "objective")).infer_objects(),  # where there are none: objects
         trials=_trials(params, seeds, trials),
         inferred=inferred,
         limits=limits,
-        one_policy=_all_of(one_policy, "summary.csv"),
-        own_plant=_all_of(own_plant, "scores.csv"),
+        one_policy=stacked(one_policy, "summary.csv"),
+        own_plant=stacked(own_plant, "scores.csv"),
         beyond=beyond,
         made_from=inputs(REPORT, params_root, scale),
         missing=tuple(seed for seed in range(n_seeds) if seed not in seeds_found),
@@ -175,40 +190,10 @@ def _folders(params: Params) -> dict[str, dict[str, str]]:
     """The stages of a case by folder, each with its names in scores.csv and their names in the report."""
     folders = {DEMONSTRATIONS: {"expert": "expert"}}
     folders[ONLINE] = {name: name for name in ("expert_paired", "online", "online_y", scorecard.MINIMUM_VARIANCE)}
-    folders |= {_offline_folder(params, variant): {"offline": name} for name, variant in OFFLINE.items()}
+    folders |= {offline_folder(params, variant): {"offline": name} for name, variant in OFFLINE.items()}
     if params.case.offline.transfer_from is not None:
         folders[SCRATCH] = {"offline": "offline_scratch"}
     return folders
-
-
-def _finished(root: Path, cases: tuple[int, ...], seeds: Sequence[int], folder: str, made_by: str) -> dict[tuple[int, int], Stage]:
-    """An optional stage by case and seed, where it was run."""
-    paths = {(case, seed): root / f"seed_{seed}" / f"case_{case}" / folder for case in cases for seed in seeds}
-    return {key: load_stage(path, made_by) for key, path in paths.items() if (path / RECORD).is_file()}
-
-
-def _limits(root: Path, cases: tuple[int, ...], seeds: Sequence[int]) -> dict[tuple[int, int, str], Stage]:
-    """The parts of notebook 06 by case, seed and part, where it was run to its end."""
-    found: dict[tuple[int, int, str], Stage] = {}
-    for case, seed in _finished(root, cases, seeds, f"limits_{LIMITS[-1]}", "notebook 06"):
-        folder = root / f"seed_{seed}" / f"case_{case}"
-        found |= {(case, seed, part): load_stage(folder / f"limits_{part}", "notebook 06") for part in LIMITS}
-    return found
-
-
-def _all_of(found: Mapping[tuple[int, int], Stage], name: str) -> pd.DataFrame:
-    """One table of every stage, with a column seed; empty without any."""
-    frames = [stage.table(name).assign(seed=seed) for (_, seed), stage in found.items()]
-    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
-
-
-def _budget(found: Mapping[tuple[int, int], Stage]) -> pd.DataFrame:
-    """The objective after online learning by the episodes of an epoch, where that was run: not for all seeds."""
-    columns = ("episodes_per_epoch", "objective")
-    tables = ((stage.table("scores.csv", columns), *place) for place, stage in found.items())
-    frames = [table.assign(seed=seed, case=case) for table, case, seed in tables if len(table)]
-    order = ["seed", "case", *columns]
-    return pd.concat(frames, ignore_index=True)[order] if frames else pd.DataFrame(columns=order)
 
 
 def _trials(
@@ -219,7 +204,7 @@ def _trials(
     for (case, name), stages in found.items():
         trial = params[case].trials[name]
         for (_, seed), stage in stages.items():
-            scores = stage.table("scores.csv", ("stage", "metric", "value")).set_index("metric")["value"]
+            scores = stage.table("scores.csv", SCORES).set_index("metric")["value"]
             rows.append((name, trial.family, trial.title, case, seed, scores["feature_gap"]))
     trials = pd.DataFrame(rows, columns=["trial", "family", "description", "case", "seed", "gap"])
     if trials.empty:

@@ -38,11 +38,7 @@ STYLE: dict[Any, Any] = {
     "legend.fontsize": 9.5,
     "lines.linewidth": 1.6,
     "lines.solid_capstyle": "round",
-    "axes.edgecolor": "#262626",
-    "axes.labelcolor": "#262626",
-    "text.color": "#262626",
-    "xtick.color": "#262626",
-    "ytick.color": "#262626",
+    **dict.fromkeys(("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color"), "#262626"),
     "axes.linewidth": 1.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -65,7 +61,8 @@ COLOURS = {
 }
 SET_POINT = "#ff8c00"
 LEVEL = "#00682f"  # horizontal lines to compare with are the expert's, mostly
-LINE_STYLES: dict[str, Any] = {"agent": "-", "expert": (0, (4, 1.6)), "set point": (0, (1, 1.2))}
+LINE_STYLES: dict[str, Any] = {"agent": "-", "expert": (0, (4, 1.6))}
+AIM: dict[str, Any] = {"color": SET_POINT, "linestyle": (0, (1, 1.2))}
 KIND_STYLES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.2, 1, 1.2)))
 BAND_OPACITY = 0.2
 BAND = "mean ± standard deviation"
@@ -73,19 +70,14 @@ SINGLE = "single seeds"
 THIN = 0.7  # width of the line of a single seed
 LOOP_COLOURS = ("#0173b2", "#de8f05", "#029e73", "#d55e00", "#cc78bc", "#ca9161")  # told apart by the colour-blind too
 TIME_LABEL = "control interaction (sample)"
+FIRST = 30  # interactions that Figure 4 shows
 FEW_POINTS = 40  # a curve of at most that many points shows each of them
 MANY_POINTS = 1000  # thin lines of more points become a picture inside the SVG, which would be ten times as large
 
 INK = "#333333"
 MUTED = "#6e6e6e"
 
-
-def use_style() -> None:
-    """One style for all figures, for the whole session: much of it counts only when a figure is written or shown."""
-    plt.rcParams.update(STYLE)
-
-
-use_style()
+plt.rcParams.update(STYLE)  # for the whole session: much of it counts only when a figure is written or shown
 
 
 def control_figure(
@@ -95,7 +87,6 @@ def control_figure(
     set_point: Sequence[float],
     descriptions: Mapping[str, str] | None = None,
     agent_label: str = r"agent $\pi^A$, after online learning",
-    expert_label: str = r"PID $\pi^E$",
     zoom_from: int | None = 5,
     size: tuple[float, float] | None = None,
 ) -> Figure:
@@ -112,11 +103,10 @@ def control_figure(
         zoom_from: first sample of the zoom; None: no zoom.
         size: width and height in inches, where the figure is not as wide as the report.
     """
-    n_loops = len(controlled)
+    n_loops, words = len(controlled), descriptions or {}
     heights = (6, 4) if zoom_from is None else (6, 4, 6)
     figure = empty_figure(*(size or (max(WIDTH, WIDTH / 2 * n_loops), 8.2)))
     grid = figure.add_gridspec(len(heights), n_loops, height_ratios=heights)
-    words = descriptions or {}
     for loop, (output, entry, target) in enumerate(zip(controlled, manipulated, set_point, strict=True)):
         axes = figure.add_subplot(grid[0, loop])
         _draw_response(axes, response, output, target)
@@ -132,7 +122,7 @@ def control_figure(
             _finish(zoom, ascii_uppercase[n_loops + loop], output, words, zoom_from)
             zoom.set_xlabel(TIME_LABEL)
     figure.align_ylabels()
-    _legend(figure, response, ("controlled", "manipulated"), agent_label, expert_label)
+    _legend(figure, response, ("controlled", "manipulated"), agent_label, r"PID $\pi^E$")
     return figure
 
 
@@ -143,11 +133,10 @@ def tracking_figure(
     descriptions: Mapping[str, str] | None = None,
     agent_label: str = r"agent $\pi^A$, after offline learning",
     expert_label: str = r"demonstrated $\pi^E$",
-    n_samples: int = 30,
 ) -> Figure:
     """Figure 4: the response of each loop over the first interactions, learned against demonstrated."""
     figure = empty_figure(max(WIDTH, WIDTH / 2 * len(controlled)), 4.0)
-    early = response[response["time_index"] <= n_samples]
+    early = response[response["time_index"] <= FIRST]
     for loop, (output, target) in enumerate(zip(controlled, set_point, strict=True)):
         axes = figure.add_subplot(1, len(controlled), loop + 1)
         _draw_response(axes, early, output, target)
@@ -171,102 +160,95 @@ def learning_curves(
         return_levels, gap_levels: horizontal lines by label, such as the expert's return or the paper's gap.
     """
     weights = [column for column in history if column.startswith("alpha:")]
-    panels = ["mean return", *(["feature gap"] if "feature_gap" in history and history["feature_gap"].notna().any() else [])]
-    panels += ["reward weights"] if weights else []
+    panels: dict[str, tuple[list[str], str, Mapping[str, float]]] = {  # columns, label of the axis, horizontal lines
+        "mean return": (["mean_return"], "discounted return (no unit)", return_levels or {})
+    }
+    if "feature_gap" in history and history["feature_gap"].notna().any():
+        panels["feature gap"] = (["feature_gap"], "gap to the expert (%, log scale)", gap_levels or {})
+    if weights:
+        panels["reward weights"] = (weights, "weight (no unit)", {})
     figure = empty_figure(max(6.0, WIDTH / 3 * len(panels)), 4.0)
-    epochs = history["epochs"]
+    epochs, n_seeds = history["epochs"], _n_seeds(history)
     points: Any = {"marker": "o" if epochs.nunique() <= FEW_POINTS else "", "markersize": 3}
-    n_seeds = _n_seeds(history)
-    for index, panel in enumerate(panels):
+    for index, (panel, (columns, unit, levels)) in enumerate(panels.items()):
         axes = figure.add_subplot(1, len(panels), index + 1)
-        levels: Mapping[str, float] = {}
-        if panel == "mean return":
-            _draw_runs(axes, history, "epochs", "mean_return", color=INK, label=panel, **points)
-            axes.set_ylabel("discounted return (no unit)")
-            levels = return_levels or {}
-        elif panel == "feature gap":
-            _draw_runs(axes, history, "epochs", "feature_gap", color=INK, label=panel, **points)
-            axes.set_ylabel("gap to the expert (%, log scale)")
+        of_weights = columns is weights
+        styles = feature_styles([column.removeprefix("alpha:") for column in weights]) if of_weights else {panel: {"color": INK}}
+        for column, (label, style) in zip(columns, styles.items(), strict=True):
+            _draw_runs(axes, history, "epochs", column, label=label, **style, **points)
+        axes.set_ylabel(unit)
+        if panel == "feature gap":
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter(FuncFormatter(_percent))
             axes.yaxis.set_minor_formatter(FuncFormatter(_percent_of_few))
-            levels = gap_levels or {}
-        else:
-            styles = feature_styles([column.removeprefix("alpha:") for column in weights])
-            for column, (label, style) in zip(weights, styles.items(), strict=True):
-                _draw_runs(axes, history, "epochs", column, label=label, **style, **points)
-            axes.set_ylabel("weight (no unit)")
-        listed: list[Line2D] = [line for line in axes.lines if panel == "reward weights"]
+        listed: list[Line2D] = [*axes.lines] if of_weights else []
         if n_seeds > 1 and panel == "mean return":
             listed += _seed_handles(n_seeds)
-        for (name, level), style in zip(levels.items(), cycle(KIND_STYLES[1:]), strict=False):
-            listed += axes.plot([epochs.min(), epochs.max()], [level, level], color=LEVEL, linestyle=style, label=name)
+        listed += _draw_levels(axes, epochs, levels)
         for (epoch, name), style in zip((marks or {}).items(), cycle(KIND_STYLES[2:]), strict=False):
             mark = axes.axvline(epoch, color=MUTED, linestyle=style, linewidth=1.2, label=name)
-            listed += [mark] if panel != "reward weights" else []  # the other panels explain it
+            listed += [] if of_weights else [mark]  # the other panels explain it
         if listed:
-            n_columns = len({name.rpartition("-")[2] for name in weights}) if panel == "reward weights" else 1
+            n_columns = len({name.rpartition("-")[2] for name in weights}) if of_weights else 1
             place: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.19), "frameon": False}
             legend = axes.legend(handles=listed, ncols=n_columns, columnspacing=1.0, handlelength=2.0, **place)
             for line in legend.get_lines():
                 line.set_marker("")  # it would hide the dashes
-        letter = ascii_uppercase[index]
-        title = panel[:1].upper() + panel[1:] + (r" $\alpha$" if panel == "reward weights" else "")
-        axes.set_title(f"$\\mathbf{{{letter}}}$  {title}" if len(panels) > 1 else title, loc="left")
+        title = panel[:1].upper() + panel[1:] + (r" $\alpha$" if of_weights else "")
+        head(axes, ascii_uppercase[index] if len(panels) > 1 else "", title, f"{ascii_uppercase[index]} {panel}")
         axes.set_xlabel("epoch")
         axes.xaxis.set_major_locator(MaxNLocator(5, integer=True, steps=[1, 2, 5, 10]))
-        axes.set_label(f"{letter} {panel}")
     return figure
 
 
-def budget_curve(axes: Axes, frame: pd.DataFrame, reference: Mapping[str, float]) -> Axes:
-    """The objective after online learning against the plant episodes that each epoch was given.
-
-    Args:
-        frame: columns seed, episodes_per_epoch, objective, of one case.
-        reference: objectives to compare with, by label: horizontal lines.
-    """
-    _draw_runs(axes, frame, "episodes_per_epoch", "objective", color=COLOURS["controlled", "agent"], label="online", marker="o")
-    episodes = np.sort(frame["episodes_per_epoch"].unique())
-    for (name, level), style in zip(reference.items(), cycle(KIND_STYLES[1:]), strict=False):
-        axes.plot(episodes[[0, -1]], [level, level], color=LEVEL, linestyle=style, linewidth=1.2, label=name)
-    axes.set_xscale("log")
-    axes.set_xticks(episodes, [f"{number:g}" for number in episodes])
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.set_xlabel("plant episodes per epoch (log)")
-    axes.set_ylabel("tracking objective $J$ (no unit)")
-    return axes
-
-
 def budget_figure(frame: pd.DataFrame, references: Mapping[int, Mapping[str, float]], titles: Mapping[int, str]) -> Figure:
-    """`budget_curve` for every case side by side.
+    """The objective after online learning against the plant episodes that each epoch was given, a panel for each case.
 
     Args:
         frame: columns seed, case, episodes_per_epoch, objective.
-        references, titles: by case.
+        references: by case, objectives to compare with, by label: horizontal lines.
+        titles: by case.
     """
     cases = sorted(frame["case"].unique())
     figure = empty_figure(max(6.0, WIDTH / 3 * len(cases)), 3.8)
-    for index, case in enumerate(cases):
-        axes = budget_curve(figure.add_subplot(1, len(cases), index + 1), frame[frame["case"] == case], references[case])
-        axes.set_title(f"$\\mathbf{{{ascii_uppercase[index]}}}$  {titles[case]}", loc="left")
-        axes.set_label(f"{ascii_uppercase[index]} case {case}")
+    look: Any = {"color": COLOURS["controlled", "agent"], "label": "online", "marker": "o"}
+    for index, (letter, case) in enumerate(zip(ascii_uppercase, cases, strict=False)):
+        axes, rows = figure.add_subplot(1, len(cases), index + 1), frame[frame["case"] == case]
+        _draw_runs(axes, rows, "episodes_per_epoch", "objective", **look)
+        episodes = np.sort(rows["episodes_per_epoch"].unique())
+        _draw_levels(axes, episodes, references[case], linewidth=1.2)
+        axes.set_xscale("log")
+        axes.set_xticks(episodes, [f"{number:g}" for number in episodes])
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.set_xlabel("plant episodes per epoch (log)")
+        axes.set_ylabel("tracking objective $J$ (no unit)")
+        head(axes, letter, titles[case], f"{letter} case {case}")
     handles = [*figure.axes[0].lines, *_seed_handles(_n_seeds(frame))[:1]]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 
+def _draw_levels(axes: Axes, x: Any, levels: Mapping[str, float], **style: Any) -> list[Line2D]:
+    """Horizontal lines to compare with, by label, from the least x to the greatest."""
+    found = zip(levels.items(), cycle(KIND_STYLES[1:]), strict=False)
+    lines = [axes.plot([min(x), max(x)], [y, y], color=LEVEL, linestyle=dash, label=name, **style) for (name, y), dash in found]
+    return [line for (line,) in lines]
+
+
+def head(axes: Axes, letter: str, title: str, name: str) -> None:
+    """The title of a panel, after its letter if it has one, and the name by which `drawn_summary` lists it."""
+    axes.set_title(f"$\\mathbf{{{letter}}}$  {title}" if letter else title, loc="left")
+    axes.set_label(name)
+
+
 def feature_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """A line style for each feature, by its label: one colour a loop, one dash pattern a kind."""
-    parts = {name: name.rpartition("-") for name in names}
-    loops = list(dict.fromkeys(loop for loop, _, _ in parts.values()))
-    kinds = list(dict.fromkeys(kind for _, _, kind in parts.values()))
+    parts = [name.rpartition("-") for name in names]
+    colours = dict(zip(dict.fromkeys(loop for loop, _, _ in parts), cycle(LOOP_COLOURS), strict=False))
+    dashes = dict(zip(dict.fromkeys(kind for _, _, kind in parts), cycle(KIND_STYLES), strict=False))
     return {
-        feature_symbol(name): {
-            "color": LOOP_COLOURS[loops.index(loop) % len(LOOP_COLOURS)],
-            "linestyle": KIND_STYLES[kinds.index(kind) % len(KIND_STYLES)],
-        }
-        for name, (loop, _, kind) in parts.items()
+        feature_symbol(name): {"color": colours[loop], "linestyle": dashes[kind]}
+        for name, (loop, _, kind) in zip(names, parts, strict=True)
     }
 
 
@@ -283,8 +265,7 @@ def drawn_summary(figure: Figure) -> pd.DataFrame:
         outlines = [(band.get_label(), path.vertices) for band in bands for path in band.get_paths()]
         for label, points in [*((line.get_label(), line.get_xydata()) for line in axes.lines), *outlines]:
             x, y = np.asarray(points, dtype=float).T
-            values = {"first": y[0], "minimum": np.nanmin(y), "maximum": np.nanmax(y), "mean": np.nanmean(y), "last": y[-1]}
-            rows.append({"panel": panel, "artist": label, "points": len(y), "from": x.min(), "to": x.max(), **values})
+            rows.append([panel, label, len(y), x.min(), x.max(), y[0], np.nanmin(y), np.nanmax(y), np.nanmean(y), y[-1]])
     columns = ["panel", "artist", "points", "from", "to", "first", "minimum", "maximum", "mean", "last"]
     return pd.DataFrame(rows, columns=columns)
 
@@ -343,8 +324,7 @@ def _draw_response(
         axes.plot(time, mean, color=colour, linestyle=LINE_STYLES[controller], drawstyle=steps, label=label)
     limits = [response["time_index"].min(), response["time_index"].max()]
     if set_point is not None:
-        style = LINE_STYLES["set point"]
-        axes.plot(limits, [set_point, set_point], color=SET_POINT, linestyle=style, linewidth=2, label="set point")
+        axes.plot(limits, [set_point, set_point], linewidth=2, label="set point", **AIM)
     axes.set_xlim(*limits)
 
 
@@ -386,9 +366,8 @@ def _finish(axes: Axes, letter: str, variable: str, descriptions: Mapping[str, s
     title = f"{words[:1].upper()}{words[1:]} {symbol(variable)}".strip()
     if zoom_from is not None:
         title = f"Zoom of {symbol(variable)} from sample {zoom_from}"
-    axes.set_title(f"$\\mathbf{{{letter}}}$  {title}" if letter else title, loc="left")
+    head(axes, letter, title, " ".join(part for part in (letter, variable, "" if zoom_from is None else "zoom") if part))
     axes.set_ylabel(f"{symbol(variable)} ({DEVIATION})".replace(", ", ",\n"))
-    axes.set_label(" ".join(part for part in (letter, variable, "" if zoom_from is None else "zoom") if part))
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True, steps=[1, 2, 5, 10]))
 
 
@@ -401,7 +380,7 @@ def _legend(figure: Figure, response: pd.DataFrame, kinds: Sequence[str], agent_
     ]
     n_seeds = _n_seeds(response)
     over = f", medians over {n_seeds} seeds" if n_seeds > 1 else ""
-    below = [Line2D([], [], color=SET_POINT, linestyle=LINE_STYLES["set point"], linewidth=2, label="set point")]
+    below = [Line2D([], [], linewidth=2, label="set point", **AIM)]
     if n_seeds > 1:
         below.append(Line2D([], [], color=INK, linewidth=THIN, label="thin lines: the mean of each seed"))
     band = Patch(facecolor="#888888", alpha=0.35, label=f"line and band: {BAND}{over}")

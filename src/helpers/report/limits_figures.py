@@ -1,6 +1,7 @@
 """Figures of notebook 06, drawn from tables; they compute no result."""
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from string import ascii_uppercase
 from typing import Any
 
@@ -13,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from seaborn import heatmap
 
-from helpers.report.figures import INK, KIND_STYLES, LOOP_COLOURS, MUTED, WIDTH, empty_figure
-from helpers.report.tables import ROMAN
+from helpers.report.figures import INK, KIND_STYLES, LOOP_COLOURS, MUTED, WIDTH, empty_figure, head
+from helpers.report.tables import case_study
 
 LABELS = {
     "expert": "PID (demonstrator)",
@@ -41,18 +42,9 @@ LABELS = {
     "dynamic_programme_filtered": "programme, filtered y",
     "dynamic_programme": "programme on x",
 }
-LEARNERS = (
-    "irl_reinforce",
-    "clone_reinforce",
-    "csil_reinforce",
-    "scratch_reinforce",
-    "ppo",
-    "recurrent_ppo",
-    "pid_tuned",
-    "pid_scheduled",
-)
 THE_PAPERS = "irl_reinforce"
-RIVALS = tuple(name for name in LEARNERS if name != THE_PAPERS)  # they need no model
+RIVALS = ("clone_reinforce", "csil_reinforce", "scratch_reinforce", "ppo", "recurrent_ppo", "pid_tuned", "pid_scheduled")
+LEARNERS = (THE_PAPERS, *RIVALS)  # the rivals need no model
 LEVELS = ("one_policy", "mpc", "minimum_variance", "expert", "dynamic_programme")
 RUNS = {"hot": "hot start", "cloned": "from the clone", "scratch": "from scratch"}
 NOTHING = "#c8c8c8"  # under a condition in which no controller earns anything
@@ -71,24 +63,19 @@ def gap_figure(gaps: pd.DataFrame, panel: str = "beta") -> Figure:
         gaps: columns beta or case, controller, gap, gap_low, gap_high, in per cent.
         panel: the column that tells the panels apart.
     """
-    values = sorted(gaps[panel].unique())
-    figure = empty_figure(WIDTH, 0.6 + 0.27 * gaps["controller"].nunique())
     listed = [name for name in LABELS if name in set(gaps["controller"])][::-1]
-    for index, (value, axes) in enumerate(zip(values, np.atleast_1d(figure.subplots(1, len(values), sharey=True)), strict=True)):
-        rows = gaps[gaps[panel] == value].set_index("controller").reindex(listed)
-        reach = np.stack([rows["gap"] - rows["gap_low"], rows["gap_high"] - rows["gap"]])
-        axes.errorbar(rows["gap"], range(len(rows)), xerr=reach, fmt="o", color=INK, markersize=4, label="gap and 95 % interval")
+    figure = empty_figure(WIDTH, 0.6 + 0.27 * len(listed))
+    panels = np.atleast_1d(figure.subplots(1, gaps[panel].nunique(), sharey=True))
+    for letter, (value, rows), axes in zip(ascii_uppercase, gaps.groupby(panel), panels, strict=False):
+        found = rows.set_index("controller").reindex(listed)
+        reach = np.stack([found["gap"] - found["gap_low"], found["gap_high"] - found["gap"]])
+        axes.errorbar(found["gap"], range(len(found)), xerr=reach, fmt="o", color=INK, markersize=4, label="gap and 95 % interval")
         axes.axvline(0, color=MUTED, linewidth=1)
-        axes.set_yticks(range(len(rows)), [LABELS[name] for name in rows.index])
+        axes.set_yticks(range(len(found)), [LABELS[name] for name in listed])
         axes.set_xlabel("gap to the programme (%)")
-        title = f"$\\beta = {value:g}$" if panel == "beta" else _case(value)
-        axes.set_title(f"$\\mathbf{{{ascii_uppercase[index]}}}$  {title}", loc="left")
-        axes.set_label(f"{ascii_uppercase[index]} {panel} {value:g}")
+        title = f"$\\beta = {value:g}$" if panel == "beta" else case_study(value)
+        head(axes, letter, title, f"{letter} {panel} {value:g}")
     return figure
-
-
-def _case(case: int) -> str:
-    return f"Case Study {ROMAN[case - 1]}"
 
 
 def budget_curves(curves: pd.DataFrame, levels: Mapping[str, float]) -> Figure:
@@ -117,9 +104,8 @@ def budget_by_case(curves: pd.DataFrame, levels: Mapping[int, Mapping[str, float
     panels = np.atleast_1d(figure.subplots(1, len(levels)))
     for axes, (case, of_case) in zip(panels, levels.items(), strict=True):
         _draw_budget(axes, curves[curves["case"] == case], of_case)
-        axes.set_title(_case(case), loc="left")
+        head(axes, "", case_study(case), f"budget {case}")
         axes.set_ylabel(axes.get_ylabel() if axes is panels[0] else "")
-        axes.set_label(f"budget {case}")
         axes.xaxis.set_major_locator(MaxNLocator(3, integer=True))
     known = {line.get_label(): line for axes in panels for line in axes.lines}
     figure.legend(handles=list(known.values()), loc="outside lower center", ncols=3, frameon=False)
@@ -127,19 +113,15 @@ def budget_by_case(curves: pd.DataFrame, levels: Mapping[int, Mapping[str, float
 
 
 def _draw_budget(axes: Axes, curves: pd.DataFrame, levels: Mapping[str, float]) -> None:
-    markers = "osv^D*PX"
     names = [name for name in LEARNERS if name in set(curves["learner"])]
-    for index, name in enumerate(names):
+    for name, colour, marker in zip(names, cycle(LOOP_COLOURS), cycle("osv^D*PX"), strict=False):
         spent = curves[curves["learner"] == name].groupby("episodes")["objective"]
         low, line, high = (spent.quantile(share) for share in (0.25, 0.5, 0.75))
-        style: dict[str, Any] = {"color": LOOP_COLOURS[index % len(LOOP_COLOURS)], "marker": markers[index % len(markers)]}
-        axes.plot(line.index, line, label=LABELS[name], markersize=4, **style)
+        axes.plot(line.index, line, label=LABELS[name], markersize=4, color=colour, marker=marker)
         if (high > low).any():
-            axes.fill_between(line.index, low, high, color=style["color"], alpha=0.15, linewidth=0)
-    known = [name for name in LEVELS if name in levels]
-    for index, name in enumerate(known):
-        style = {"color": MUTED, "linestyle": KIND_STYLES[index % len(KIND_STYLES)], "linewidth": 1.2}
-        axes.axhline(levels[name], label=LABELS[name], **style)
+            axes.fill_between(line.index, low, high, color=colour, alpha=0.15, linewidth=0)
+    for name, dash in zip([name for name in LEVELS if name in levels], cycle(KIND_STYLES), strict=False):
+        axes.axhline(levels[name], label=LABELS[name], color=MUTED, linestyle=dash, linewidth=1.2)
     axes.set_xlabel("plant episodes spent")
     axes.set_ylabel("tracking objective $J$ on $x$ (no unit)")
     axes.set_ylim(bottom=0)
@@ -154,11 +136,10 @@ def heat_maps(robustness: pd.DataFrame, group: str, controllers: Sequence[str]) 
         robustness: columns group, row, column, controller, objective.
     """
     title, row_label, column_label = GRIDS[group]
-    found = robustness[robustness["group"] == group]
-    rows, columns = list(dict.fromkeys(found["row"])), list(dict.fromkeys(found["column"]))
+    found, across = robustness[robustness["group"] == group], 3
+    rows, columns = found["row"].unique(), found["column"].unique()
     table = found.pivot_table(index=["controller", "row"], columns="column", values="objective", sort=False)
     reference = table.loc["expert"].loc[rows, columns]
-    across = 3
     down = -(-len(controllers) // across)
     figure = empty_figure(WIDTH, 0.9 + down * (0.55 + 0.26 * len(rows)))
     best = table.groupby("row").max().loc[rows, columns]
@@ -187,24 +168,21 @@ def robustness_figure(shares: pd.DataFrame, groups: Mapping[str, str]) -> Figure
         shares: `limits_report.worst`: columns case, seed, controller, group, value (per cent).
         groups: words for the grids.
     """
-    medians = shares.groupby(["case", "controller", "group"])["value"].median().to_dict()
-    cases = sorted(shares["case"].unique())
     names = [name for name in LABELS if name in set(shares["controller"])]
+    heights = pd.Series(range(0, -len(names), -1), names)
     figure = empty_figure(WIDTH, 1.2 + 0.24 * len(names))
-    panels = np.atleast_1d(figure.subplots(1, len(cases), sharey=True))
-    shapes = "osD^v*"
-    for axes, case in zip(panels, cases, strict=True):
-        for index, (group, words) in enumerate(groups.items()):
-            points = [(medians[case, name, group], -y) for y, name in enumerate(names) if (case, name, group) in medians]
-            if points:
-                look: Any = {"color": LOOP_COLOURS[index], "marker": shapes[index], "markersize": 5, "linestyle": ""}
-                axes.plot(*zip(*points, strict=True), label=words, **look)
+    panels = np.atleast_1d(figure.subplots(1, shares["case"].nunique(), sharey=True))
+    for axes, (case, rows) in zip(panels, shares.groupby("case"), strict=True):
+        medians = rows.pivot_table(index="controller", columns="group", values="value", aggfunc="median").reindex(names)
+        for (group, words), colour, shape in zip(groups.items(), LOOP_COLOURS, "osD^v*", strict=False):
+            if group in medians:
+                found = medians[group].dropna()
+                axes.plot(found, heights[found.index], label=words, color=colour, marker=shape, markersize=5, linestyle="")
         axes.axvline(100, color=MUTED, linewidth=1, linestyle=KIND_STYLES[1])
-        axes.set_title(_case(case), loc="left")
+        head(axes, "", case_study(case), f"case {case}")
         axes.set_xlabel("% of the PID's $J$ there")
         axes.set_xlim(left=0)
-        axes.set_label(f"case {case}")
-    panels[0].set_yticks([-y for y in range(len(names))], [LABELS[name] for name in names])
+    panels[0].set_yticks(heights, [LABELS[name] for name in names])
     figure.legend(handles=panels[0].lines[: len(set(shares["group"]))], loc="outside lower center", ncols=4, frameon=False)
     return figure
 
@@ -218,7 +196,7 @@ def regret_figure(episodes: pd.DataFrame) -> Figure:
     figure = empty_figure(WIDTH, 3.8)
     dip, left, right = figure.subplots(1, 3)
     for index, (run, group) in enumerate(episodes.groupby("run", sort=False)):
-        style: dict[str, Any] = {"color": LOOP_COLOURS[index], "linestyle": KIND_STYLES[index], "label": RUNS[str(run)]}
+        style: Any = {"color": LOOP_COLOURS[index], "linestyle": KIND_STYLES[index], "label": RUNS[str(run)]}
         by_epoch = group.groupby("epoch")[["objective", "expert"]]
         mean, worst = by_epoch.mean(), by_epoch.min()
         dip.plot(mean.index, 100 * mean["objective"] / mean["expert"], marker="o", markersize=3, **style)
@@ -232,7 +210,6 @@ def regret_figure(episodes: pd.DataFrame) -> Figure:
     left.set(xlabel="epoch", ylabel="$J$ of the worst episode (no unit)")
     right.set(xlabel="plant episode", ylabel="cumulative regret\nagainst the PID (no unit)")
     for axes, letter, name in ((dip, "A", "dip at the onset"), (left, "B", "worst episode"), (right, "C", "regret")):
-        axes.set_title(f"$\\mathbf{{{letter}}}$  {name[:1].upper()}{name[1:]}", loc="left")
-        axes.set_label(f"{letter} {name}")
+        head(axes, letter, f"{name[:1].upper()}{name[1:]}", f"{letter} {name}")
     figure.legend(handles=left.lines, loc="outside lower center", ncols=4, frameon=False)
     return figure

@@ -2,21 +2,9 @@
 
 from typing import Any
 
-import pandas as pd
-
+from helpers.report import limits_report
 from helpers.report.collection import Results
 from helpers.report.limits_figures import LABELS, LEARNERS, RIVALS
-from helpers.report.limits_report import (
-    ahead,
-    listed_budgets,
-    on_mismatch,
-    plant_names,
-    read,
-    sharp_gaps,
-    summary,
-    unholdable,
-    worst,
-)
 from helpers.report.statistics import FEWEST, median_interval
 from helpers.report.tables import symbol
 
@@ -26,16 +14,15 @@ END_IN_REINFORCE = ("online", "irl_reinforce", "irl_alone", "clone_reinforce", "
 
 def find(results: Results) -> dict[str, Any]:
     """What the section says, by the name of the function below that found it; nothing where notebook 06 was not run."""
-    if read(results, "attainable", "gaps.csv").empty:
+    if limits_report.read(results, "attainable", "gaps.csv").empty:
         return {}
     learning = (seeds, attainable, agreement, standings, tuned, practice, not_found)
-    parts = (*learning, ranges, left_out, there, out_of_reach, price)
-    return {part.__name__: part(results) for part in parts}
+    return {part.__name__: part(results) for part in (*learning, ranges, left_out, there, out_of_reach, price)}
 
 
 def seeds(results: Results) -> dict[int, int]:
     """How many seeds there are of each case."""
-    found: dict[int, int] = read(results, "attainable", "gaps.csv").groupby("case")["seed"].nunique().to_dict()
+    found: dict[int, int] = limits_report.read(results, "attainable", "gaps.csv").groupby("case")["seed"].nunique().to_dict()
     return found
 
 
@@ -45,7 +32,7 @@ def attainable(results: Results) -> dict[int, dict[str, float]]:
     look_ahead: what it gains over one-step control; noise: what it loses behind a filter; filter: what filtering gives one-step
     control on y.
     """
-    gaps = sharp_gaps(results).pivot_table(index="case", columns="controller", values="gap", aggfunc="median")
+    gaps = limits_report.sharp_gaps(results).pivot_table(index="case", columns="controller", values="gap", aggfunc="median")
     return {
         int(case): {
             "look_ahead": row["minimum_variance_x"],
@@ -58,7 +45,7 @@ def attainable(results: Results) -> dict[int, dict[str, float]]:
 
 def agreement(results: Results) -> float:
     """The largest difference between the programme's value and that of its policy by Monte Carlo, in per cent."""
-    grids = read(results, "attainable", "grids.csv").drop_duplicates(["case", "seed", "beta"], keep="last")
+    grids = limits_report.read(results, "attainable", "grids.csv").drop_duplicates(["case", "seed", "beta"], keep="last")
     return 100 * float(grids["difference"].abs().max())
 
 
@@ -68,7 +55,8 @@ def standings(results: Results) -> dict[int, dict[str, dict[str, list[int]]]]:
     Cases with too few seeds for an interval are left out.
     """
     found: dict[int, dict[str, dict[str, list[int]]]] = {}
-    for row in summary(ahead(listed_budgets(results))).dropna(subset="ci_low").itertuples():
+    differences = limits_report.summary(limits_report.ahead(limits_report.listed_budgets(results)))
+    for row in differences.dropna(subset="ci_low").itertuples():
         word = "ahead" if row.ci_low > 0 else "behind" if row.ci_high < 0 else "level"
         found.setdefault(row.metric, {}).setdefault(row.stage, {}).setdefault(word, []).append(row.case)
     return dict(sorted(found.items()))
@@ -76,13 +64,11 @@ def standings(results: Results) -> dict[int, dict[str, dict[str, list[int]]]]:
 
 def tuned(results: Results) -> dict[int, dict[str, float]]:
     """By case, how the searches for gains of the PID ended: in how many seeds above `TUNED`, and the range of the objective."""
-    curves = read(results, "budget", "curves.csv").query("learner == 'pid_tuned'").sort_values("episodes")
-    found = {}
-    for case, rows in curves.groupby("case"):
-        ends = rows.groupby("seed")["objective"].agg(["first", "last"])
-        better = int((ends["last"] > TUNED * ends["first"]).sum())
-        found[int(case)] = {"better": better, "seeds": len(ends), "least": ends["last"].min(), "greatest": ends["last"].max()}
-    return found
+    curves = limits_report.read(results, "budget", "curves.csv").query("learner == 'pid_tuned'").sort_values("episodes")
+    ends = curves.groupby(["case", "seed"])["objective"].agg(["first", "last"])
+    by_case = ends.assign(better=ends["last"] > TUNED * ends["first"]).groupby("case")
+    found = by_case.agg(better=("better", "sum"), seeds=("last", "size"), least=("last", "min"), greatest=("last", "max"))
+    return found.to_dict("index")
 
 
 def practice(results: Results) -> dict[str, Any]:
@@ -92,17 +78,17 @@ def practice(results: Results) -> dict[str, Any]:
     that no condition puts below the PID; least: the range of what those that end in REINFORCE keep of the PID's objective at other
     set points, in per cent; without_model: by budget the best that needs none, with its cases. All in the median.
     """
-    listed = listed_budgets(results).astype({"metric": int})
+    listed = limits_report.listed_budgets(results).astype({"metric": int})
     medians = listed.groupby(["case", "metric", "learner"])["value"].median()
-    reached = sharp_gaps(results).groupby(["case", "controller"])["objective"].median()
+    reached = limits_report.sharp_gaps(results).groupby(["case", "controller"])["objective"].median()
     model_ahead: list[int] = []
     without_model: dict[int, dict[str, list[int]]] = {}
-    for (case, budget), row in medians.unstack("learner").iterrows():  # noqa: PD010
+    for (case, budget), row in medians.unstack("learner").iterrows():
         if budget == max(listed["metric"]) and reached[case, "minimum_variance"] > row.reindex(LEARNERS).max():
             model_ahead.append(int(case))
         if budget and (others := row.reindex(RIVALS).dropna()).size:
             without_model.setdefault(int(budget), {}).setdefault(LABELS[others.idxmax()], []).append(int(case))
-    shares = worst(results)
+    shares = limits_report.worst(results)
     kept = shares.pivot_table(index="controller", columns=["case", "group"], values="value", aggfunc="median").drop(index="expert")
     points = shares[(shares["group"] == "set_point") & shares["controller"].isin(END_IN_REINFORCE)]
     least = points.groupby(["case", "controller"])["value"].median()
@@ -116,7 +102,7 @@ def practice(results: Results) -> dict[str, Any]:
 
 def not_found(results: Results) -> dict[int, list[str]]:
     """By case, the learners with a loop whose mean response comes to no 90 % of the change in most seeds, and that loop."""
-    quality = read(results, "quality", "quality.csv")
+    quality = limits_report.read(results, "quality", "quality.csv")
     rises = quality[quality["figure"].str.startswith("rise_time:") & quality["controller"].isin(LEARNERS)]
     missed = rises.assign(missed=rises["value"].isna()).groupby(["case", "controller", "figure"], sort=False)["missed"].mean()
     found: dict[int, list[str]] = {}
@@ -127,7 +113,7 @@ def not_found(results: Results) -> dict[int, list[str]]:
 
 def ranges(results: Results) -> str:
     """What the grids of conditions span, in words."""
-    robust = read(results, "robustness", "robustness.csv")
+    robust = limits_report.read(results, "robustness", "robustness.csv")
     words = {
         "model": "A and B times {} and {}",
         "noise": "disturbance times {} and observation noise times {}",
@@ -135,20 +121,17 @@ def ranges(results: Results) -> str:
         "time": "dead time of {} samples and a load step of {} of the set point change per sample",
     }
     spans = robust.astype({"row": float, "column": float}).groupby("group")[["row", "column"]].agg(["min", "max"])
-    found = []
-    for group, text in words.items():
-        if group in spans.index:
-            ends = spans.loc[group]
-            found.append(text.format(*(f"{ends[axis, 'min']:g} to {ends[axis, 'max']:g}" for axis in ("row", "column"))))
-    return "; ".join(found)
+    ends = {
+        group: [f"{row[axis, 'min']:g} to {row[axis, 'max']:g}" for axis in ("row", "column")] for group, row in spans.iterrows()
+    }
+    return "; ".join(text.format(*ends[group]) for group, text in words.items() if group in ends)
 
 
 def left_out(results: Results) -> dict[str, dict[int, tuple[int, int]]]:
     """By group and case, how many of how many conditions were left out because no input within the bounds holds the set point."""
-    robust = read(results, "robustness", "robustness.csv")
-    place = ["case", "group", "row", "column"]
-    total = robust[place].drop_duplicates().groupby(["group", "case"]).size()
-    out = unholdable(results).groupby(["group", "case"]).size()
+    robust = limits_report.read(results, "robustness", "robustness.csv")
+    total = robust.drop_duplicates(["case", "group", "row", "column"]).groupby(["group", "case"]).size()
+    out = limits_report.unholdable(results).groupby(["group", "case"]).size()
     found: dict[str, dict[int, tuple[int, int]]] = {}
     for (group, case), count in out.items():
         found.setdefault(group, {})[int(case)] = (int(count), int(total[group, case]))
@@ -157,9 +140,11 @@ def left_out(results: Results) -> dict[str, dict[int, tuple[int, int]]]:
 
 def out_of_reach(results: Results) -> dict[str, list[int]]:
     """By mismatched plant that was improved on, the cases of which no input within the bounds holds the set point there."""
-    out = unholdable(results).query("group == 'model'")
-    out = out.assign(plant=plant_names(out["row"].astype(float), out["column"].astype(float)))
-    found: dict[str, list[int]] = out[out["plant"].isin(on_mismatch(results)["plant"])].groupby("plant")["case"].agg(list).to_dict()
+    out = limits_report.unholdable(results).query("group == 'model'")
+    out = out.assign(plant=limits_report.plant_names(out["row"].astype(float), out["column"].astype(float)))
+    found: dict[str, list[int]] = (
+        out[out["plant"].isin(limits_report.on_mismatch(results)["plant"])].groupby("plant")["case"].agg(list).to_dict()
+    )
     return found
 
 
@@ -168,13 +153,13 @@ def there(results: Results) -> dict[str, dict[int, list[str]]]:
 
     By the whole interval of the difference within seeds; nothing for too few seeds.
     """
-    every = on_mismatch(results)
     found: dict[str, dict[int, list[str]]] = {}
-    for (plant, case), rows in every.groupby(["plant", "case"], sort=False):
+    for (plant, case), rows in limits_report.on_mismatch(results).groupby(["plant", "case"], sort=False):
         reached = rows.pivot_table(index="seed", columns="controller", values="objective")
         if len(reached) >= FEWEST:
             others = [name for name in LABELS if name in reached and name != "online_there"]
-            behind = [LABELS[name] for name in others if _low(reached["online_there"] - reached[name]) <= 0]
+            ahead_by = {name: (reached["online_there"] - reached[name]).dropna().to_numpy() for name in others}
+            behind = [LABELS[name] for name, differences in ahead_by.items() if median_interval(differences)[0] <= 0]
             found.setdefault(plant, {})[int(case)] = behind
     return found
 
@@ -185,13 +170,8 @@ def price(results: Results) -> dict[int, dict[str, float]]:
     worse: the exploring episodes that were worse than the PID; set_point and model: the least share of the PID's objective that
     the improved policy reaches at set points not trained on and on plants that are not the model, where the bounds allow it.
     """
-    safety = read(results, "safety", "safety.csv")
+    safety = limits_report.read(results, "safety", "safety.csv")
     worse = 100 * safety[safety["run"] == "hot"].groupby("case")["worse"].median()
-    online = worst(results).query("controller == 'online'")
+    online = limits_report.worst(results).query("controller == 'online'")
     kept = online.pivot_table(index="case", columns="group", values="value", aggfunc="median")
     return kept.reindex(columns=["set_point", "model"]).assign(worse=worse).to_dict("index")
-
-
-def _low(differences: pd.Series) -> float:
-    """The lower end of the interval of the median difference."""
-    return float(median_interval(differences.dropna().to_numpy())[0])

@@ -1,25 +1,16 @@
 """The section of the report on limits and alternatives, where notebook 06 was run: its tables and figures, and what they say."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
+from itertools import product
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from scipy.optimize import lsq_linear
 
-from helpers.report import scorecard
-from helpers.report.collection import Results
-from helpers.report.limits_figures import (
-    GRIDS,
-    LABELS,
-    RIVALS,
-    RUNS,
-    THE_PAPERS,
-    budget_by_case,
-    gap_figure,
-    heat_maps,
-    robustness_figure,
-)
+from helpers.report import limits_figures, scorecard
+from helpers.report.collection import Results, stacked
+from helpers.report.limits_figures import GRIDS, LABELS, RIVALS, RUNS, THE_PAPERS
 from helpers.report.tables import NOT_KNOWN, ROMAN, spread, symbol
 from helpers.settings.paper import Params
 
@@ -65,9 +56,7 @@ GROUPS = {"model": "model", "noise": "noise", "set_point": "set points", "time":
 
 def read(results: Results, part: str, name: str) -> pd.DataFrame:
     """One table of one part of notebook 06 for all cases and seeds, with columns case and seed; empty where none was run."""
-    stages = {(case, seed): stage for (case, seed, of_part), stage in results.limits.items() if of_part == part}
-    frames = [stage.table(name).assign(case=case, seed=seed) for (case, seed), stage in stages.items()]
-    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
+    return stacked({(case, seed): stage for (case, seed, of_part), stage in results.limits.items() if of_part == part}, name)
 
 
 def tabulate(results: Results) -> dict[str, pd.DataFrame]:
@@ -81,18 +70,21 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
         return {}
     budget = read(results, "budget", "curves.csv").rename(columns={"learner": "controller", "objective": "value"})
     listed = listed_budgets(results)
+    pairs, shares = ahead(listed), worst(results)
     there = on_mismatch(results).rename(columns={"plant": "metric", "objective": "value"})
     quality = read(results, "quality", "quality.csv").rename(columns={"figure": "metric"})
-    safety = read(results, "safety", "safety.csv").melt(["case", "seed", "run"], var_name="metric")
+    safety = read(results, "safety", "safety.csv").rename(columns={"run": "controller"})
+    safety = safety.rename(columns=SAFETY).melt(["case", "seed", "controller"], var_name="metric")
+    pairs = _wide(pairs.assign(metric=pairs["metric"].map("after {:,}".format)), decimals=2)
     return {
         "limits_gaps": _gaps(gaps),
         "limits_attainable": _attainable(gaps),
         "limits_budget": _budget(listed),
-        "limits_pairs": _wide(ahead(listed), int, "after {:,}", decimals=2).rename(columns={"controller": "rival"}),
-        "limits_robustness": _wide(worst(results).rename(columns={"group": "metric"}), str, "{}", GROUPS, decimals=0),
-        "limits_improved": _wide(there, str, "{}", decimals=1),
+        "limits_pairs": pairs.rename(columns={"controller": "rival"}),
+        "limits_robustness": _wide(shares.assign(metric=shares["group"].map(GROUPS)), decimals=0),
+        "limits_improved": _wide(there, decimals=1),
         **{f"limits_{table}": _quality(quality, figures) for table, figures in QUALITY.items()},
-        "limits_safety": _wide(safety.rename(columns={"run": "controller"}), str, "{}", SAFETY, RUNS),
+        "limits_safety": _wide(safety, RUNS),
     } | ({"limits_curves": budget} if len(budget) else {})
 
 
@@ -183,21 +175,21 @@ def _gaps(gaps: pd.DataFrame) -> pd.DataFrame:
     columns: dict[str, dict[str, str]] = {}
     for (case, beta), rows in _with_interval(gaps, "gap", ("gap_low", "gap_high")).groupby(["case", "beta"]):
         found = rows.set_index("controller")
-        column = f"{ROMAN[case - 1]}, $\\beta$ = {beta:g}"
-        columns[column] = {name: spread(found.loc[name], decimals=1) for name in LABELS if name in found.index}
-    return _labelled(pd.DataFrame(columns))
+        columns[f"{ROMAN[case - 1]}, $\\beta$ = {beta:g}"] = {name: spread(row, decimals=1) for name, row in found.iterrows()}
+    table = pd.DataFrame(columns)
+    table = table.reindex([name for name in LABELS if name in table.index])
+    return table.rename(index=LABELS).rename_axis("controller").reset_index()
 
 
 def _attainable(gaps: pd.DataFrame) -> pd.DataFrame:
     """The objective of the controllers that know the process: a row for each case and controller, a column for each beta."""
     known = [name for name in LABELS if name.startswith(("minimum_variance", "dynamic_programme"))]
-    found = _with_interval(gaps, "objective", ("low", "high")).set_index(["case", "controller", "beta"])
+    found = _with_interval(gaps, "objective", ("low", "high")).sort_values("beta")
     rows = []
-    for case in sorted(gaps["case"].unique()):
-        for name in known:
-            places = {beta: (case, name, beta) for beta in sorted(gaps["beta"].unique()) if (case, name, beta) in found.index}
-            cells = {f"$J$, $\\beta$ = {beta:g}": spread(found.loc[place], decimals=2) for beta, place in places.items()}
-            rows.append({"case": ROMAN[case - 1], "controller": LABELS[name]} | cells)
+    for case, name in product(sorted(gaps["case"].unique()), known):
+        of_both = found[(found["case"] == case) & (found["controller"] == name)]
+        cells = {f"$J$, $\\beta$ = {row['beta']:g}": spread(row, decimals=2) for _, row in of_both.iterrows()}
+        rows.append({"case": ROMAN[case - 1], "controller": LABELS[name]} | cells)
     return pd.DataFrame(rows)
 
 
@@ -211,7 +203,8 @@ def _with_interval(gaps: pd.DataFrame, name: str, ends: tuple[str, str]) -> pd.D
 
 def _budget(listed: pd.DataFrame) -> pd.DataFrame:
     """The objective at the listed budgets, and its range over the seeds at the last of them."""
-    table = _wide(listed.rename(columns={"learner": "controller"}), int, "J after {:,}", decimals=2)
+    metric = listed["metric"].astype(int).map("J after {:,}".format)
+    table = _wide(listed.rename(columns={"learner": "controller"}).assign(metric=metric), decimals=2)
     if len(set(listed["seed"])) == 1:
         return table
     last = listed[listed["metric"] == listed["metric"].iloc[-1]].groupby(["case", "learner"])["value"].agg(["min", "max"])
@@ -237,27 +230,17 @@ def listed_budgets(results: Results) -> pd.DataFrame:
     return budget.melt(["case", "seed", "learner"], var_name="metric") if len(budget) else budget
 
 
-def _wide(
-    frame: pd.DataFrame,
-    kind: Callable,
-    header: str,
-    words: dict[str, str] | None = None,
-    names: dict[str, str] | None = None,
-    decimals: int | Mapping[str, int] | None = None,
-) -> pd.DataFrame:
+def _wide(frame: pd.DataFrame, names: Mapping[str, str] = LABELS, decimals: int | Mapping[str, int] | None = None) -> pd.DataFrame:
     """Medians of long rows (case, seed, controller, metric, value): a row for each case and controller, a column a metric."""
-    found = summary(frame.assign(value=frame["value"].round(PLACES)))  # a reward of 1e-90 is nought
-    order, rows = list(dict.fromkeys(frame["metric"])), []
-    for case in sorted(frame["case"].unique()):
-        numbers = found[found["case"] == case].set_index(["stage", "metric"])
-        for name, label in (names or LABELS).items():
-            if name in set(frame["controller"]):
-                shown = {}
-                for metric in order:
-                    places = decimals[metric] if isinstance(decimals, Mapping) else decimals
-                    cell = _cell(numbers.reindex([(name, metric)]).iloc[0], places)
-                    shown[header.format(kind((words or {}).get(metric, metric)))] = cell
-                rows.append({"case": ROMAN[case - 1], "controller": label} | shown)
+    found = summary(frame.assign(value=frame["value"].round(PLACES))).set_index(["case", "stage", "metric"])  # 1e-90 is nought
+    rows = []
+    for case, name in product(sorted(frame["case"].unique()), names):
+        if name in set(frame["controller"]):
+            row = {"case": ROMAN[case - 1], "controller": names[name]}
+            for metric in frame["metric"].unique():
+                places = decimals[metric] if isinstance(decimals, Mapping) else decimals
+                row[metric] = _cell(found.reindex([(case, name, metric)]).iloc[0], places)
+            rows.append(row)
     return pd.DataFrame(rows)
 
 
@@ -287,15 +270,11 @@ def _quality(quality: pd.DataFrame, figures: Mapping[str, tuple[str, int, int]])
     rows["value"] = (rows["value"] * factors).mask(overshoots).fillna(NEVER)
     headers, decimals = {}, {}
     for row in rows.drop_duplicates("metric").itertuples():
-        header, _, decimals[row.metric] = figures[row.figure]
+        header, _, places = figures[row.figure]
         words, bracket, unit = header.partition(" (")
         headers[row.metric] = f"{words}, {symbol(row.variable)}{bracket}{unit}"
-    return _wide(rows, str, "{}", headers, decimals=decimals)
-
-
-def _labelled(table: pd.DataFrame) -> pd.DataFrame:
-    ordered = table.reindex([name for name in LABELS if name in table.index])
-    return ordered.rename(index=LABELS).rename_axis("controller").reset_index()
+        decimals[headers[row.metric]] = places
+    return _wide(rows.assign(metric=rows["metric"].map(headers)), decimals=decimals)
 
 
 def draw(results: Results) -> dict[str, Figure]:
@@ -307,15 +286,15 @@ def draw(results: Results) -> dict[str, Figure]:
     shown = _with_interval(sharp, "gap", ("gap_low", "gap_high"))
     shown = shown.rename(columns={"median": "gap", "ci_low": "gap_low", "ci_high": "gap_high"})
     drawn = {
-        "limits_budget": budget_by_case(read(results, "budget", "curves.csv"), levels),
-        "limits_gaps": gap_figure(shown, "case"),
-        "limits_robustness": robustness_figure(worst(results), GROUPS),
+        "limits_budget": limits_figures.budget_by_case(read(results, "budget", "curves.csv"), levels),
+        "limits_gaps": limits_figures.gap_figure(shown, "case"),
+        "limits_robustness": limits_figures.robustness_figure(worst(results), GROUPS),
     }
     robust, place = read(results, "robustness", "robustness.csv"), ["group", "row", "column", "controller"]
     for name in heat_map_names(results):
         group, _, case = name.removeprefix("limits_").rpartition("_case_")
         cells = robust[robust["case"] == int(case)].groupby(place, as_index=False, sort=False)["objective"].median()
-        drawn[name] = heat_maps(cells, group, list(cells["controller"].unique()))
+        drawn[name] = limits_figures.heat_maps(cells, group, list(cells["controller"].unique()))
     return drawn
 
 

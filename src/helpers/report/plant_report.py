@@ -106,13 +106,10 @@ def offline(plant: OwnPlant, workshop: Workshop) -> tuple[dict[str, pd.DataFrame
         study, found = learn_offline(plant, model, task_on(plant, model))
     except TrainingError as error:
         return {}, f"the weights of the record's controller were not found: {error}"
+    if (gap := min(record.feature_gap for record in found.records)) > MEANINGLESS:
+        why = "a feature of the record is next to zero, its variable is far from its set point"
+        return {}, f"Algorithm 2 has nothing to match: {why}"
     weights = pd.DataFrame({"alpha*": found.weights.tolist()}, index=study.feature_names)
-    gap = min(record.feature_gap for record in found.records)
-    if gap > MEANINGLESS:
-        return (
-            {},
-            "Algorithm 2 has nothing to match: a feature of the record is next to zero, its variable is far from its set point",
-        )
     return {"Reward weights": weights}, f"Algorithm 2 matches the features of the record to {100 * gap:.1f} %"
 
 

@@ -16,17 +16,17 @@ from helpers.learning.policy import RELU6_TOP, LSTMPolicy
 from helpers.learning.tracking_policy import TrackingPolicy
 from helpers.own_plant.deploy import export, export_c, write
 from helpers.plant.task import ControlTask
+from helpers.report.collection import ONE_POLICY, ONLINE, offline_folder
 from helpers.report.tables import ROMAN
 from helpers.runs.artifacts import RECORD, load_stage
 from helpers.runs.policies import TrainedPolicy, rebuilt
 from helpers.runs.sources import PROJECT
-from helpers.settings.paper import HEADLINE, Params, load, load_published
+from helpers.settings.paper import Params, load, load_published
 
-ONE = "one_policy"
 TRAINED_ON = {
     "offline": "the records of the PID and the model of the process, by Algorithms 1 and 2 in our variant; not on the plant",
     "online": "the offline policy of its case and simulated episodes of the plant, for the tracking objective",
-    ONE: "the model of the process, by the gradient through it, for set points drawn from the range below; not on the plant",
+    ONE_POLICY: "the model of the process, by the gradient through it, for set points drawn from the range below; not on the plant",
 }
 CARD = """\
 # {name}
@@ -70,18 +70,20 @@ class ModeStep(nn.Module):
 def write_policies(first: Path, folder: Path, params_root: Path = PROJECT / "params") -> None:
     """Write every policy that the results of a seed in `first` hold, as safetensors, ONNX and C, and its card."""
     cases = {case: load(params_root, case) for case in load_published(params_root)}
-    places = {ONE: (ONE, list(cases), f"case_1/{ONE}")}
+    places = {ONE_POLICY: (ONE_POLICY, list(cases), f"case_1/{ONE_POLICY}")}
     for case, params in cases.items():
-        offline = "offline" if params.case.offline.transfer_from is None else "transfer"
-        for kind, stage in (("offline", offline), ("online", "online")):
-            places[f"case_{case}_{kind}"] = (kind, [case], f"case_{case}/{stage}_{HEADLINE}")
+        for kind, stage in (("offline", offline_folder(params)), ("online", ONLINE)):
+            places[f"case_{case}_{kind}"] = (kind, [case], f"case_{case}/{stage}")
     for name, (kind, of_cases, place) in places.items():
         if (first / place / RECORD).is_file():
             found = load_stage(first / place, "make evidence")
             state, params = load_file(found.path("policy.safetensors")), cases[of_cases[0]]
-            card = _card(kind, found.record, params, state) | {"cases": of_cases}
+            card = _card(kind, found.record, params, state) | {"cases": of_cases, "scores": {}}
             trained = TrainedPolicy(rebuilt(params.learning.policy, state), card)
-            card["scores"] = {str(case): _scores(trained, case, params_root) for case in of_cases}
+            for case in of_cases:  # on the episodes on which the published run has judged them
+                study = trained.study(case, params_root)
+                rivals = {"policy": trained.policy, "PID": study.expert, "minimum variance": study.minimum_variance}
+                card["scores"][str(case)] = {who: study.judge(study.fresh(rival))["objective_x"] for who, rival in rivals.items()}
             folder.mkdir(parents=True, exist_ok=True)
             (folder / f"{name}.safetensors").write_bytes(save(state, {"card": json.dumps(card)}))
             (folder / f"{name}.md").write_text(_shown(name, card), encoding="utf-8")
@@ -91,19 +93,12 @@ def write_policies(first: Path, folder: Path, params_root: Path = PROJECT / "par
                 export_c(_write_onnx(trained.policy, task, Path(scratch) / "static.onnx", {}, static=True), folder / f"{name}.c")
 
 
-def _scores(trained: TrainedPolicy, case: int, params_root: Path) -> dict[str, float]:
-    """J of the policy and of its rivals on the episodes on which the published run has judged them."""
-    study = trained.study(case, params_root)
-    controllers = {"policy": trained.policy, "PID": study.expert, "minimum variance": study.minimum_variance}
-    return {name: study.judge(study.fresh(controller))["objective_x"] for name, controller in controllers.items()}
-
-
 def _card(kind: str, record: Mapping[str, Any], params: Params, state: Mapping[str, Tensor]) -> dict[str, Any]:
     """What a policy file tells about itself, but for its scores."""
     process, target = params.process, torch.tensor(params.case.set_point)
     low, high = (state.get("centre", target) + sign * state.get("reach", 0 * target) for sign in (-1, 1))
     return {
-        "title": "One policy for all case studies." if kind == ONE else f"{params.case.title}; after {kind} learning.",
+        "title": "One policy for all case studies." if kind == ONE_POLICY else f"{params.case.title}; after {kind} learning.",
         "trained_on": TRAINED_ON[kind],
         **{key: record[key] for key in ("notebook", "seed", "scale", "revision")},
         "set_point_range": dict(zip(process.controlled, torch.stack([low, high], dim=1).tolist(), strict=True)),

@@ -13,7 +13,7 @@ import pandas as pd
 
 from helpers.report.limits_figures import LABELS, LEARNERS
 from helpers.report.policies import write_policies
-from helpers.report.tables import ROMAN, spread
+from helpers.report.tables import NOT_KNOWN, ROMAN, spread
 from helpers.runs.artifacts import code_revision
 from helpers.runs.sources import PROJECT
 
@@ -23,6 +23,14 @@ LIMITS = "tables/limits_gaps.csv"
 SHOWN = ("expert", "online", *LEARNERS, "mpc", "minimum_variance", "dynamic_programme_filtered")
 LEARNT, VARIANTS = re.compile(r"0[24]_(?:offline_irl|knowledge_transfer)_(\w+)"), ("improved", "printed")
 LINK = re.compile(r"\]\((?:(\.\./)|(?=\d\d_\w+\.ipynb\)))")
+GLANCE = {  # of tables/gaps.csv, and its headers in README
+    "expert_error": "expert error",
+    "published_gap": "feature gap, paper",
+    "feature_gap": "feature gap, ours",
+    "printed_gap": "the same, algorithms as printed",
+    "online_share": "online objective, share of minimum variance",
+}
+ENDS = {"median": "", "ci_low": "_low", "ci_high": "_high"}
 PARTS = ("report.html", "report.pdf", "report.md", "figures", "tables", "comparison.csv", "seeds.csv", "provenance.json")
 
 
@@ -35,8 +43,7 @@ def read_provenance(folder: Path) -> dict[str, Any]:
     path = folder / "provenance.json"
     if not path.is_file():
         raise PublishError(f"{path}: there is no report; run make reports first")
-    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return found
+    return dict(json.loads(path.read_text(encoding="utf-8")))
 
 
 def check(latest: dict[str, Any], reference: dict[str, Any] | None, revision: str) -> None:
@@ -64,11 +71,9 @@ def glance(gaps: pd.DataFrame) -> str:
     rows = []
     for numbers in gaps.to_dict("records"):
         row = {"case study": ROMAN[int(numbers["case"]) - 1]}
-        row["expert error"] = _percent(numbers, "expert_error")
-        row["feature gap, paper"] = _percent(numbers, "published_gap")
-        row["feature gap, ours"] = _percent(numbers, "feature_gap")
-        row["the same, algorithms as printed"] = _percent(numbers, "printed_gap")
-        row["online objective, share of minimum variance"] = _percent(numbers, "online_share")
+        for name, header in GLANCE.items():  # in per cent, with the ends of the interval where there is one
+            found = {key: 100 * numbers.get(name + end, float("nan")) for key, end in ENDS.items()}
+            row[header] = spread(found, decimals=1, unit=" %")
         rows.append(row)
     n_seeds = int(gaps["n_seeds"].min())
     intervals = " and 95 % bootstrap intervals of the median" if gaps["feature_gap_low"].notna().all() else ""
@@ -76,17 +81,11 @@ def glance(gaps: pd.DataFrame) -> str:
     return f"{pd.DataFrame(rows).to_markdown(index=False)}\n\n(ours: {seeds})"
 
 
-def _percent(numbers: Mapping[Any, Any], name: str) -> str:
-    """A share in per cent, with the ends of its interval where it has one."""
-    median, low, high = (100 * numbers.get(f"{name}{end}", float("nan")) for end in ("", "_low", "_high"))
-    return spread({"median": median, "ci_low": low, "ci_high": high}, decimals=1, unit=" %")
-
-
 def time_by_stage(time: pd.DataFrame) -> str:
     """README's seconds by stage and case, as Markdown, from tables/time.csv."""
     wide = time.pivot_table(index="stage", columns="case", values="seconds")
     wide.columns = [f"case {case}, s" for case in wide.columns]
-    cells = wide.map(lambda seconds: "–" if pd.isna(seconds) else f"{seconds:.0f}").reset_index()
+    cells = wide.map(lambda seconds: NOT_KNOWN if pd.isna(seconds) else f"{seconds:.0f}").reset_index()
     return f"Seconds inside each stage's notebook, medians over seeds, two stages at a time:\n\n{cells.to_markdown(index=False)}"
 
 
@@ -121,18 +120,6 @@ def cost(time: pd.DataFrame, provenance: Mapping[str, Any]) -> str:
     )
 
 
-def check_copies(copies: Iterable[Path]) -> None:
-    """Refuse executed copies of notebooks that failed: a mark beside each says so."""
-    if failed := [path for path in copies if path.with_suffix(".failed").exists()]:
-        raise PublishError(f"{', '.join(map(str, failed))}: failed when it was run last; run make reports or make evidence again")
-
-
-def check_tables(latest: Path, reference: Path) -> None:
-    """Refuse a report without the claims or the limits that the published one has."""
-    if missing := [name for name in ("tables/claims.csv", LIMITS) if (reference / name).exists() and not (latest / name).exists()]:
-        raise PublishError(f"{latest}: the run lacks {' and '.join(missing)}, which the published one has; run make evidence")
-
-
 def executed_copies(first: Path) -> dict[str, Path]:
     """The executed copies to publish, by their published names; `first` is the folder of the first seed's results.
 
@@ -163,10 +150,13 @@ def publish() -> None:
     latest = read_provenance(LATEST)
     reference = read_provenance(REFERENCE) if (REFERENCE / "provenance.json").is_file() else None
     check(latest, reference, code_revision(PROJECT))
-    check_tables(LATEST, REFERENCE)
+    evidence = [name for name in ("tables/claims.csv", LIMITS) if (REFERENCE / name).exists()]
+    if missing := [name for name in evidence if not (LATEST / name).exists()]:
+        raise PublishError(f"{LATEST}: the run lacks {' and '.join(missing)}, which the published one has; run make evidence")
     first = RESULTS / latest["scale"] / f"seed_{latest['seeds'][0]}"
     copies = executed_copies(first)
-    check_copies(copies.values())
+    if failed := [path for path in copies.values() if path.with_suffix(".failed").exists()]:  # a mark beside a copy
+        raise PublishError(f"{', '.join(map(str, failed))}: failed when it was run last; run make reports or make evidence again")
     time = pd.read_csv(LATEST / "tables/time.csv")
     blocks = {"glance": glance(pd.read_csv(LATEST / "tables/gaps.csv")), "cost": cost(time, latest), "time": time_by_stage(time)}
     if (LATEST / LIMITS).exists():

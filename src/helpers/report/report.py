@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from helpers.evidence.readings import MAIN
 from helpers.report import drawings, figures, limits_findings, limits_report, scorecard, statistics, tables, verdict_figures
-from helpers.report.collection import ONLINE, Results
+from helpers.report.collection import ONLINE, Results, offline_folder
 from helpers.report.limits_figures import GRIDS, LABELS, RIVALS
 from helpers.report.typesetting import render, shortened, to_html, to_pdf
 from helpers.runs.artifacts import ArtifactError, code_revision
@@ -46,45 +46,38 @@ def draw(results: Results, compared: pd.DataFrame) -> dict[str, Figure]:
     """
     first = next(iter(results.params.values()))
     policy, process = first.learning.policy, first.process
-    descriptions = dict(zip(process.controlled, process.controlled_description, strict=True))
-    descriptions |= dict(zip(process.manipulated, process.manipulated_description, strict=True))
+    outputs, inputs = process.controlled, process.manipulated
+    words = (*process.controlled_description, *process.manipulated_description)
+    descriptions = dict(zip((*outputs, *inputs), words, strict=True))
     drawn = {
         "comparison": verdict_figures.comparison_figure(compared),
         "figure_1": drawings.mdp_figure(),
         "figure_2": drawings.framework_figure(),
-        "network": drawings.network_figure(
-            policy.hidden_cells, len(process.controlled), len(process.manipulated), policy.leaky_slope
-        ),
+        "network": drawings.network_figure(policy.hidden_cells, len(outputs), len(inputs), policy.leaky_slope),
     }
     levels = {
         case: {tables.CONTROLLERS[stage]: results.median(case, stage, "objective_x") for stage in LEVELS} for case in results.params
     }
     for case, params in results.params.items():
-        target = params.case.set_point
-        offline = results.offline_folder(case)
+        target, offline = params.case.set_point, offline_folder(params)
         response = results.table(case, ONLINE, "response.csv")
-        drawn[f"control_case_{case}"] = figures.control_figure(
-            response, process.controlled, process.manipulated, target, descriptions
-        )
-        if case == next(iter(results.params)):
+        drawn[f"control_case_{case}"] = figures.control_figure(response, outputs, inputs, target, descriptions)
+        if params is first:
             look: dict[str, Any] = {"zoom_from": None, "size": (verdict_figures.NARROW, 3.9), "agent_label": "improved policy"}
-            drawn["page_one"] = figures.control_figure(response, process.controlled, process.manipulated, target, **look)
+            drawn["page_one"] = figures.control_figure(response, outputs, inputs, target, **look)
         response = results.table(case, offline, "response.csv")
-        drawn[f"tracking_case_{case}"] = figures.tracking_figure(response, process.controlled, target, descriptions)
+        drawn[f"tracking_case_{case}"] = figures.tracking_figure(response, outputs, target, descriptions)
         history = results.table(case, offline, "history.csv")
         chosen = round(results.median(case, "offline", "chosen_epoch"))
-        words = "policy taken from here" + (" (median)" if results.n_seeds > 1 else "")
-        drawn[f"learning_curves_case_{case}"] = figures.learning_curves(
-            history.filter(regex="^(?!alpha:)"),
-            marks={chosen: words},
-            gap_levels={"the paper's own gap": results.published[case].feature_gap},
-        )
+        marks = {chosen: "policy taken from here" + (" (median)" if results.n_seeds > 1 else "")}
+        papers, unweighted = {"the paper's own gap": results.published[case].feature_gap}, history.filter(regex="^(?!alpha:)")
+        drawn[f"learning_curves_case_{case}"] = figures.learning_curves(unweighted, marks=marks, gap_levels=papers)
         drawn[f"weights_{case}"] = verdict_figures.weights_figure(history, compared[compared["case"] == case])
         history = results.table(case, ONLINE, "history.csv")
         marks = _rounds(params.case.online, history["epochs"].nunique())
         drawn[f"online_curves_case_{case}"] = figures.learning_curves(history, marks=marks, return_levels=levels[case])
     if len(results.budget):
-        titles = {case: f"Case Study {tables.ROMAN[case - 1]}" for case in results.params}
+        titles = {case: tables.case_study(case) for case in results.params}
         drawn["online_budget"] = figures.budget_figure(results.budget, levels, titles)
     if len(results.claims):
         drawn["claims"] = verdict_figures.claims_figure(scorecard.claims_by_case(results.claims))
@@ -103,9 +96,8 @@ def _rounds(online: OnlineParams, n_epochs: int) -> dict[int, str]:
 
 def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     """All tables of the report by name."""
-    names, medians = results.feature_names, results.medians
-    process = next(iter(results.params.values())).process
-    scale = next(iter(results.params.values())).learning.scales[results.scale]
+    names, medians, first = results.feature_names, results.medians, next(iter(results.params.values()))
+    process, scale = first.process, first.learning.scales[results.scale]
     trajectories = {"expert": scale.expert_evaluation, "policy": scale.evaluation}
     compared = scorecard.comparison(results.published, results.seeds, medians, names, trajectories)
     tabulated = {
@@ -224,7 +216,7 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
 
 def said(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapping[str, Any]) -> dict[str, Any]:
     """What the templates say, by name; every number in their prose comes from the results."""
-    numbers = results.medians.set_index(scorecard.KEYS)[["median", "ci_low", "ci_high"]]
+    numbers = results.numbers[["median", "ci_low", "ci_high"]]
     compared, limits = tabulated["comparison"], limits_findings.find(results)
 
     def number(case: int, stage: str, metric: str, factor: float = 1, **style: Any) -> str:
@@ -302,11 +294,13 @@ def _better(results: Results) -> dict[str, list[int]]:
 
     printed and worse_as_printed: those in which the gap of the algorithms as printed lies below the paper's, and above it.
     """
-    numbers = results.medians.set_index(scorecard.KEYS)
-    low, high = (numbers[end].fillna(numbers["median"]) for end in ("ci_low", "ci_high"))
+    low, high = (results.numbers[end].fillna(results.numbers["median"]) for end in ("ci_low", "ci_high"))
     papers = {case: record.feature_gap for case, record in results.published.items()}
-    gap = [case for case in papers if high[case, "offline", "feature_gap"] < papers[case]]
-    worse = [case for case in papers if low[case, "offline_printed", "feature_gap"] > papers[case]]
-    online = [case for case in results.params if low[case, "online", "objective_x"] > high[case, "expert_paired", "objective_x"]]
-    printed = [case for case in papers if high[case, "offline_printed", "feature_gap"] < papers[case]]
-    return {"gap": gap, "printed": printed, "worse_as_printed": worse, "online": online}
+    return {
+        "gap": [case for case in papers if high[case, "offline", "feature_gap"] < papers[case]],
+        "printed": [case for case in papers if high[case, "offline_printed", "feature_gap"] < papers[case]],
+        "worse_as_printed": [case for case in papers if low[case, "offline_printed", "feature_gap"] > papers[case]],
+        "online": [
+            case for case in results.params if low[case, "online", "objective_x"] > high[case, "expert_paired", "objective_x"]
+        ],
+    }

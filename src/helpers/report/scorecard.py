@@ -73,16 +73,21 @@ def gaps(medians: pd.DataFrame, published: Mapping[int, PublishedCase]) -> pd.Da
     Args:
         medians: of `summary`, with the rows of `relative`.
     """
+    found, wide = medians.set_index(KEYS), ("median", "ci_low", "ci_high", "p90", "greatest")
+    wanted = {  # name: stage, metric, what is shown
+        "feature_gap": ("offline", "feature_gap", wide),
+        "printed_gap": ("offline_printed", "feature_gap", wide[:3]),
+        "expert_error": ("expert", "published_error", wide[:3]),
+        "online_share": ("online", "share", wide[:3]),
+    }
     rows = []
     for case, printed in published.items():
-        by_number = medians[medians["case"] == case].set_index(["stage", "metric"])
-        wanted = {"offline": "feature_gap", "offline_printed": "feature_gap", "expert": "published_error", "online": "share"}
-        gap, as_printed, error, share = (by_number.reindex([key]).iloc[0] for key in wanted.items())
-        row = {"case": case, "n_seeds": int(np.nan_to_num(gap["n_seeds"])), "feature_gap": gap["median"]}
-        row |= {f"feature_gap_{name.removeprefix('ci_')}": gap[name] for name in ("ci_low", "ci_high", "p90", "greatest")}
-        row["published_gap"] = printed.feature_gap
-        for name, ours in (("printed_gap", as_printed), ("expert_error", error), ("online_share", share)):
-            row |= {name: ours["median"], f"{name}_low": ours["ci_low"], f"{name}_high": ours["ci_high"]}
+        row: dict[str, float] = {"case": case, "n_seeds": 0}
+        for name, (stage, metric, shown) in wanted.items():
+            numbers = found.reindex([(case, stage, metric)]).iloc[0]
+            row |= {f"{name}_{what.removeprefix('ci_')}".removesuffix("_median"): numbers[what] for what in shown}
+            if name == "feature_gap":
+                row |= {"n_seeds": int(np.nan_to_num(numbers["n_seeds"])), "published_gap": printed.feature_gap}
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -140,20 +145,15 @@ def comparison(
         for row, (stage, metric) in REPRODUCED_BY.items():
             for feature, value in zip(feature_names, getattr(printed, row), strict=True):
                 key = (case, stage, f"{metric}:{feature}")
-                if key not in found.index:
-                    rows.append([printed.table, case, row, feature, value, np.nan, 0, *[np.nan] * 4, *verdict(row, value, 0, 0, 0)])
-                    continue
-                lacking = 0.0
-                if metric == "v":
-                    share = max(0.0, 1 / PUBLISHED_TRAJECTORIES - 1 / trajectories[row])
+                ours = found.reindex([key]).iloc[0]
+                n_seeds, lacking = int(np.nan_to_num(ours["n_seeds"])), 0.0
+                if n_seeds and metric == "v":
                     if error := (sampling_errors or {}).get((case, feature)):
                         variance = PUBLISHED_TRAJECTORIES * error**2
                     else:
                         variance = float(np.mean(runs[case, stage, f"v:{feature}:std"] ** 2))
-                    lacking = variance * share
-                low, high = prediction_interval(runs[key], lacking)
-                ours = found.loc[key]
-                n_seeds = int(ours["n_seeds"])
+                    lacking = variance * max(0.0, 1 / PUBLISHED_TRAJECTORIES - 1 / trajectories[row])
+                low, high = prediction_interval(runs.get(key, ()), lacking)
                 numbers = [ours["median"], n_seeds, ours["ci_low"], ours["ci_high"], low, high]
                 rows.append([printed.table, case, row, feature, value, *numbers, *verdict(row, value, n_seeds, low, high)])
     return pd.DataFrame(rows, columns=COLUMNS)
@@ -209,20 +209,13 @@ def held_out(prediction: pd.DataFrame) -> pd.DataFrame:
     Args:
         prediction: columns fitted_on, table, deviation and relative_error of each feature, on trajectories that no fit has seen.
     """
+    errors = prediction.assign(error=100 * prediction["relative_error"].abs(), deviation=prediction["deviation"].abs())
     rows = []
-    for (fitted_on, table), features in prediction.groupby(["fitted_on", "table"], sort=False):
+    for (fitted_on, table), features in errors.groupby(["fitted_on", "table"], sort=False):
         fitted = fitted_on == "parameter files" or str(table) in fitted_on.removeprefix("Table ").split(" and ")
-        errors = 100 * features["relative_error"].abs()
-        rows.append(
-            {
-                "fitted_on": fitted_on,
-                "table": table,
-                "role": "fit" if fitted else "prediction",
-                "mean_error, %": errors.mean(),
-                "greatest_error, %": errors.max(),
-                "greatest_deviation": features["deviation"].abs().max(),
-            }
-        )
+        row = {"fitted_on": fitted_on, "table": table, "role": "fit" if fitted else "prediction"}
+        row |= {"mean_error, %": features["error"].mean(), "greatest_error, %": features["error"].max()}
+        rows.append(row | {"greatest_deviation": features["deviation"].max()})
     return pd.DataFrame(rows)
 
 
@@ -234,10 +227,10 @@ def against_headline(trials: pd.DataFrame) -> dict[str, str]:
     """
     gaps = trials.pivot_table(index=["case", "seed"], columns="trial", values="gap")
     found = {}
-    for name in gaps.drop(columns=HEADLINE):
+    for name, differences in gaps.drop(columns=HEADLINE).sub(gaps[HEADLINE], axis=0).items():
         cases: dict[str, list[str]] = {"better": [], "worse": []}
-        for case, differences in (gaps[name] - gaps[HEADLINE]).dropna().groupby("case"):
-            low, high = median_interval(differences.to_numpy())
+        for case, of_case in differences.dropna().groupby("case"):
+            low, high = median_interval(of_case.to_numpy())
             if word := "better" if high < 0 else "worse" if low > 0 else "":
                 cases[word].append(ROMAN[case - 1])
         found[name] = "; ".join(f"{word} in {', '.join(numerals)}" for word, numerals in cases.items() if numerals) or NOT_KNOWN

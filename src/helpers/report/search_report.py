@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 
 from helpers.evidence.printed_search import Search
 from helpers.evidence.weights_set import sampled
-from helpers.report.figures import INK, LEVEL, LOOP_COLOURS, MUTED, WIDTH, empty_figure, lay_out
-from helpers.report.tables import ROMAN, feature_symbol
+from helpers.report.figures import INK, LEVEL, LOOP_COLOURS, MUTED, WIDTH, empty_figure, head, lay_out
+from helpers.report.tables import case_study, feature_symbol
 from helpers.runs.artifacts import code_revision, save_stage
 from helpers.runs.identity import versions
 from helpers.runs.sources import PROJECT
@@ -58,8 +58,7 @@ def gap_figure(trials: pd.DataFrame, published: Mapping[int, PublishedCase]) -> 
         axes.axhline(medians[-1], color=LOOP_COLOURS[3], linestyle=":", label="best settings, median over seeds")
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
-        axes.set_title(f"Case Study {ROMAN[case - 1]}", loc="left")
-        axes.set_label(f"case {case}")
+        head(axes, "", case_study(case), f"case {case}")
     figure.supxlabel("rank of the setting on the first seed")
     figure.supylabel("feature gap (%)")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)
@@ -87,12 +86,9 @@ def weights_figure(weights: pd.DataFrame, learnt: Mapping[str, pd.DataFrame], pu
         axes.axhline(0, color=MUTED, linewidth=1)
         axes.set_xticks(range(len(columns)), [feature_symbol(name.removeprefix("alpha:")) for name in columns])
         least, relearnt = 100 * tried["gap"].min(), 100 * printed["gap"].median()
-        words = (
-            f"within {100 * own:.1f} %: {within} of {len(tried)} sampled; the nearest {least:.1f} %; the printed {relearnt:.1f} %"
-        )
-        axes.set_title(f"Case Study {ROMAN[case - 1]}, gaps of the best policies {words}", loc="left")
+        words = f"gaps of the best policies within {100 * own:.1f} %: {within} of {len(tried)} sampled"
+        head(axes, "", f"{case_study(case)}, {words}; the nearest {least:.1f} %; the printed {relearnt:.1f} %", f"case {case}")
         axes.set_ylabel(r"weight $\alpha$")
-        axes.set_label(f"case {case}")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
     return figure
 
@@ -115,17 +111,13 @@ def search(scale: str, cases: Sequence[int], results: Path) -> None:
         weights.append(sampled(kept, case))
     if set(cases) < set(published):
         return
-    tables = {"trials.csv": pd.concat(trials), "weights.csv": pd.concat(weights)}
-    tables["best.csv"] = best_of(tables["trials.csv"])
-    of_best = tables["trials.csv"][tables["trials.csv"]["setting"] == tables["trials.csv"]["case"].map(best)]
+    tried, drawn = pd.concat(trials), pd.concat(weights)
+    tables = {"trials.csv": tried, "weights.csv": drawn, "best.csv": best_of(tried)}
     learnt = {
-        r"$\alpha^*$ as printed, best settings": of_best,
+        r"$\alpha^*$ as printed, best settings": tried[tried["setting"] == tried["case"].map(best)],
         rf"$\alpha^*$, {HEADLINE}": headline_weights(REFERENCE / "seeds.csv"),
     }
-    figures = {
-        "gaps": gap_figure(tables["trials.csv"], published),
-        "weights": weights_figure(tables["weights.csv"], learnt, published),
-    }
+    figures = {"gaps": gap_figure(tried, published), "weights": weights_figure(drawn, learnt, published)}
     for figure in figures.values():
         lay_out(figure)
     folder = REFERENCE / "search" if scale == "paper" else results / scale / "search"

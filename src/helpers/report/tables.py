@@ -33,6 +33,11 @@ VARIABLE = re.compile(r"(?<![A-Za-z_])(C_A0|C_A|T_E)(?![A-Za-z0-9_])")
 LOOP = re.compile(r"(.*)\((\w+)\) control loop")
 
 
+def case_study(case: int) -> str:
+    """A case as the paper calls it."""
+    return f"Case Study {ROMAN[case - 1]}"
+
+
 def symbol(name: str) -> str:
     """A variable in TeX: C_A0 becomes $C_{A0}^*$; the star marks a deviation variable, as in the paper."""
     letter, _, index = name.partition("_")
@@ -65,20 +70,20 @@ def table_1(cases: Mapping[int, CaseParams], process: ProcessParams) -> pd.DataF
     return pd.DataFrame(rows, columns=["case_study", "system_parameter", *loops])
 
 
-def spread(numbers: Mapping[str, Any] | pd.Series, digits: int = 3, decimals: int | None = None, unit: str = "") -> str:
+def spread(numbers: Mapping[str, Any] | pd.Series, decimals: int | None = None, unit: str = "") -> str:
     """A median with its interval as text: 16.8 [16.5, 17.0]; the median alone where there is no interval or no spread at all.
 
     Args:
         numbers: median, ci_low and ci_high.
-        digits: significant digits of the greatest of them; `decimals`: instead, digits after the point.
+        decimals: digits after the point, instead of three significant digits of the greatest of them.
     """
     values = [float(numbers[name]) for name in ("median", "ci_low", "ci_high")]
     if np.isnan(values[0]):
         return NOT_KNOWN
     if decimals is None:
         size = np.nanmax(np.abs(values))
-        decimals = max(0, digits - 1 - int(np.floor(np.log10(size)))) if size > 0 else 0
-    median, low, high = (_number(value, digits, decimals) for value in values)
+        decimals = max(0, 2 - int(np.floor(np.log10(size)))) if size > 0 else 0
+    median, low, high = (_number(value, decimals=decimals) for value in values)
     bare = np.isnan(values[1:]).any() or values[1] == values[2]
     return f"{median}{unit}" if bare else f"{median}{unit} [{low}, {high}]"
 
@@ -92,7 +97,7 @@ def results_table(compared: pd.DataFrame, feature_names: Sequence[str]) -> pd.Da
     rows = []
     for row, decimals in RESULT_DECIMALS.items():
         numbers = compared[compared["row"] == row].set_index("feature").loc[list(feature_names)]
-        shown = numbers.select_dtypes("number").map(lambda value, places=decimals: _cell(value, 4, places))
+        shown = numbers.select_dtypes("number").map(_cell, decimals=decimals)
         lines = {
             "published": shown["published"],
             "reproduced": shown["reproduced"],
@@ -142,7 +147,7 @@ def variants_table(medians: pd.DataFrame) -> pd.DataFrame:
         found = group.set_index("metric")
         gap = 100 * found.loc["feature_gap", ["median", "ci_low", "ci_high", "greatest"]].astype(float)
         row = {"case": ROMAN[int(case) - 1], "learning": LEARNING[stage], "seeds": found.loc["feature_gap", "n_seeds"]}
-        row |= {"feature gap, %": spread(gap, decimals=1), "worst seed, %": _number(gap["greatest"], 4, 1)}
+        row |= {"feature gap, %": spread(gap, decimals=1), "worst seed, %": _number(gap["greatest"], decimals=1)}
         rows.append(row | {name.replace("_", " "): int(found.loc[name, "median"]) for name in COSTS})
     return pd.DataFrame(rows).sort_values(["case", "learning"], ignore_index=True)
 
@@ -173,11 +178,9 @@ def time_table(seconds: pd.DataFrame) -> pd.DataFrame:
     Args:
         seconds: columns case, stage, seconds.
     """
-    wide = seconds.pivot_table(index="stage", columns="case", values="seconds").rename(
-        columns=lambda case: f"Case {ROMAN[case - 1]}"
-    )
-    shown = wide.map(lambda value: NOT_KNOWN if np.isnan(value) else f"{value:.0f}").reset_index()
-    return shown.assign(stage=shown["stage"].str.replace("_", " "))
+    wide = seconds.pivot_table(index="stage", columns="case", values="seconds").map(_cell, decimals=0)
+    wide = wide.rename(index=lambda stage: stage.replace("_", " "), columns=lambda case: f"Case {ROMAN[case - 1]}")
+    return wide.reset_index()
 
 
 def parameters_table(leaves: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
@@ -229,8 +232,8 @@ def _header(name: str) -> str:
     return words[:1].upper() + words[1:]
 
 
-def _cell(value: Any, digits: int, decimals: int | None = None) -> str:
-    if value is None or value is pd.NA or (isinstance(value, (float, np.floating)) and np.isnan(value)):
+def _cell(value: Any, digits: int = 4, decimals: int | None = None) -> str:
+    if pd.isna(value):
         return NOT_KNOWN
     if isinstance(value, (bool, np.bool_)):
         return render(bool(value))
@@ -241,7 +244,7 @@ def _cell(value: Any, digits: int, decimals: int | None = None) -> str:
     return _text(str(value))
 
 
-def _number(value: float, digits: int, decimals: int | None) -> str:
+def _number(value: float, digits: int = 4, decimals: int | None = None) -> str:
     """Fixed decimals, or significant digits without an exponent for a large number; no minus before a zero."""
     if decimals is not None:
         return f"{round(value, decimals) + 0.0:.{decimals}f}"

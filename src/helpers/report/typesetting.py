@@ -24,13 +24,9 @@ OPTIONS = ["--standalone", "--citeproc", f"--bibliography={TEMPLATE / 'reference
 OPTIONS += ["--columns=10000"]  # otherwise a long line in the source of a table fixes the widths of its columns
 
 
-def render(template: str, folder: Path, **values: Any) -> str:
-    """A template as Markdown, its figures, tables and equations numbered.
-
-    Args:
-        folder: where the report is to stand, for links to the project's files.
-    """
-    environment = Environment(
+def environment() -> Environment:
+    """What the templates are written for."""
+    found = Environment(
         loader=FileSystemLoader(TEMPLATE),
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -38,14 +34,23 @@ def render(template: str, folder: Path, **values: Any) -> str:
         comment_start_string="{##",  # pandoc writes {#name}
         comment_end_string="##}",
     )
-    environment.filters["percent"] = lambda share: f"{100 * share:.1f} %"
-    environment.filters["numeral"] = lambda case: tables.ROMAN[case - 1]
-    environment.filters["table"] = tables.to_markdown
+    found.filters["percent"] = lambda share: f"{100 * share:.1f} %"
+    found.filters["numeral"] = lambda case: tables.ROMAN[case - 1]
+    found.filters["table"] = tables.to_markdown
+    return found
+
+
+def render(template: str, folder: Path, **values: Any) -> str:
+    """A template as Markdown, its figures, tables and equations numbered.
+
+    Args:
+        folder: where the report is to stand, for links to the project's files.
+    """
 
     def link(words: str, place: str) -> str:
         return f"[{words}]({Path(os.path.relpath(PROJECT / place, folder)).as_posix()})"
 
-    return numbered(environment.get_template(template).render(link=link, **values))
+    return numbered(environment().get_template(template).render(link=link, **values))
 
 
 def numbered(text: str) -> str:

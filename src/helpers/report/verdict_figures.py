@@ -1,6 +1,6 @@
 """Pictures of verdicts: every published number beside ours, the weights, and the paper's claims. They compute no result."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from string import ascii_uppercase
 from textwrap import fill
 from typing import Any
@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
-from helpers.report.figures import INK, MUTED, WIDTH, empty_figure, feature_styles
+from helpers.report.figures import INK, MUTED, WIDTH, empty_figure, feature_styles, head
 from helpers.report.tables import ROMAN, feature_symbol, symbol
 
 # Colour and shape of a verdict, so that it can be read without colours.
@@ -30,8 +30,10 @@ SMOOTH = 0.05  # of all epochs, over which a curve of weights is averaged
 NARROW = 7.6  # inches, of a picture on page one
 
 
-def _handles(verdicts: Sequence[str]) -> list[Line2D]:
-    return [Line2D([], [], linestyle="", label=verdict, markersize=6, **MARKS[verdict]) for verdict in verdicts]
+def _handles(verdicts: Iterable[str], found: Iterable[str]) -> list[Line2D]:
+    """The marks of those verdicts that are found, in their order, for a legend."""
+    listed = [verdict for verdict in verdicts if verdict in {*found}]
+    return [Line2D([], [], linestyle="", label=verdict, markersize=6, **MARKS[verdict]) for verdict in listed]
 
 
 def comparison_figure(compared: pd.DataFrame) -> Figure:
@@ -54,8 +56,7 @@ def comparison_figure(compared: pd.DataFrame) -> Figure:
         rows = compared[compared["table"] == table]
         for index, row in rows.iterrows():
             ours, low, high = relative.loc[index]
-            y = heights[row["row"], row["feature"]]
-            mark = MARKS[row["verdict"]]
+            y, mark = heights[row["row"], row["feature"]], MARKS[row["verdict"]]
             axes.plot([low, high], [y, y], color=mark["color"], linewidth=1.3)
             axes.plot([ours], [y], label=f"{row['row']} {row['feature']}", markersize=5.5, **mark)
         axes.axvline(0, color=INK, linewidth=1)
@@ -72,9 +73,8 @@ def comparison_figure(compared: pd.DataFrame) -> Figure:
         place: Any = {"ha": "center", "va": "center", "rotation": 90, "fontsize": 8, "color": MUTED}
         panels[0].text(-0.36, middle, words, transform=panels[0].get_yaxis_transform(), **place)
     figure.supxlabel("ours less the published number, % of it (to scale within ± 10 %)", fontsize=8.5)
-    found = set(compared["verdict"])
-    listed = [verdict for verdict in ("match", "differs", "cannot tell", "fitted") if verdict in found]
-    figure.legend(handles=_handles(listed), loc="outside upper center", ncols=4, frameon=False, fontsize=8.5)
+    listed = _handles(("match", "differs", "cannot tell", "fitted"), compared["verdict"])
+    figure.legend(handles=listed, loc="outside upper center", ncols=4, frameon=False, fontsize=8.5)
     return figure
 
 
@@ -86,12 +86,10 @@ def claims_figure(judged: pd.DataFrame) -> Figure:
     """
     cases = [column for column in judged if column in ROMAN]
     lines = [fill(statement, 96) for statement in judged["statement"]]
-    figure = empty_figure(WIDTH, 0.9 + 0.155 * sum(line.count("\n") + 1.4 for line in lines))
+    sizes = np.array([line.count("\n") + 1.4 for line in lines])
+    ends = np.cumsum([0, *sizes])
+    figure, heights = empty_figure(WIDTH, 0.9 + 0.155 * ends[-1]), -ends[:-1] - sizes / 2
     axes = figure.subplots()
-    height, heights = 0.0, []
-    for line in lines:
-        heights.append(height - (line.count("\n") + 1.4) / 2)
-        height -= line.count("\n") + 1.4
     for x, case in enumerate(cases):
         for y, verdict in zip(heights, judged[case], strict=True):
             if verdict:
@@ -99,12 +97,11 @@ def claims_figure(judged: pd.DataFrame) -> Figure:
     axes.set_yticks(heights, lines, fontsize=8)
     axes.set_xticks(range(len(cases)), cases)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
-    axes.set(xlim=(-0.6, len(cases) - 0.4), ylim=(height, 0))
+    axes.set(xlim=(-0.6, len(cases) - 0.4), ylim=(-ends[-1], 0))
     axes.set_label("claims")
     axes.spines[["left", "bottom"]].set_visible(False)
-    found = set(judged[cases].to_numpy().ravel())
-    order = [verdict for verdict in ("holds", "in part", "does not hold", "cannot tell", "not comparable") if verdict in found]
-    figure.legend(handles=_handles(order), loc="outside upper center", ncols=5, frameon=False)
+    listed = _handles(("holds", "in part", "does not hold", "cannot tell", "not comparable"), judged[cases].to_numpy().ravel())
+    figure.legend(handles=listed, loc="outside upper center", ncols=5, frameon=False)
     return figure
 
 
@@ -134,17 +131,16 @@ def weights_figure(history: pd.DataFrame, compared: pd.DataFrame) -> Figure:
                 [runs.index[-1]], [printed.loc[name, "published"]], marker="*", markersize=9, color=style["color"], clip_on=False
             )
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=3, frameon=False, handlelength=2, columnspacing=1)
-        axes.set_title(f"$\\mathbf{{{letter}}}$  Loop of {symbol(loop)}", loc="left")
+        head(axes, letter, f"Loop of {symbol(loop)}", f"{letter} {loop}")
         axes.set(xlabel="epoch", ylabel="weight (no unit)" if loop == loops[0] else "", ylim=(-1, 1))
         axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
-        axes.set_label(f"{letter} {loop}")
-    _beside_the_printed(last, printed)
-    last.set_title(f"$\\mathbf{{{ascii_uppercase[len(loops)]}}}$  Learned and printed", loc="left")
+    _beside_the_printed(last, ascii_uppercase[len(loops)], printed)
     return figure
 
 
-def _beside_the_printed(axes: Axes, printed: pd.DataFrame) -> None:
+def _beside_the_printed(axes: Axes, letter: str, printed: pd.DataFrame) -> None:
     """Each weight with its interval for one run, by its verdict, and the printed one as a star."""
+    head(axes, letter, "Learned and printed", "printed")
     heights = range(0, -len(printed), -1)
     for y, (name, row) in zip(heights, printed.iterrows(), strict=True):
         axes.plot([row["pred_low"], row["pred_high"]], [y, y], color=MARKS[row["verdict"]]["color"])
@@ -153,8 +149,6 @@ def _beside_the_printed(axes: Axes, printed: pd.DataFrame) -> None:
     axes.axvline(0, color=MUTED, linewidth=1)
     axes.set_yticks(list(heights), [feature_symbol(name) for name in printed.index])
     axes.set_xlabel("weight (no unit)")
-    axes.set_label("printed")
     star = Line2D([], [], marker="*", color=INK, linestyle="", markersize=9, label="printed")
-    found = list(dict.fromkeys(printed["verdict"]))
     place: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.17), "ncols": 2, "frameon": False, "columnspacing": 1}
-    axes.legend(handles=[star, *_handles(found)], **place)
+    axes.legend(handles=[star, *_handles(printed["verdict"].unique(), printed["verdict"])], **place)

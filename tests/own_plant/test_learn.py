@@ -87,7 +87,7 @@ def test_the_whole_chain_runs_for_any_number_of_variables(n_y, n_u, tmp_path, ro
 
 def test_the_features_are_those_of_the_record_and_on_y(tmp_path, root):
     plant = learn.open_plant(MadeUpPlant(2, 2).write(tmp_path), root, "smoke", 0)
-    found, task = plant.demonstrations, plant.task(torch.zeros(2), torch.zeros(2))
+    found, task = plant.demonstrations, plant.description.task(torch.zeros(2), torch.zeros(2), plant.dtype)
     features = plant.study(None, task).features
     assert features.params.features_on == "y"
     assert found.trajectories.y.shape[0] == HORIZON + 1

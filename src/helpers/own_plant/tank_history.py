@@ -25,13 +25,6 @@ START = pd.Timestamp("2026-01-05")
 AUTOMATIC, MANUAL, BAD = "AUTO", "MAN", "Bad"
 
 
-def pi_controller(params: HistoryParams, task_set_point: Tensor, sampling_time: float) -> PID:
-    """The PI that wrote the file, for a set point in deviation variables."""
-    none = (0.0,) * len(params.proportional)
-    gains = GainParams.model_construct(proportional=params.proportional, integral=params.integral, derivative=none)
-    return PID(gains, task_set_point, sampling_time)
-
-
 @dataclass(frozen=True)
 class Plan:
     """What happens at each of N samples: set point (N, n_y), move by hand (N, n_u), nan in automatic, feed drift (N,) in K."""
@@ -76,7 +69,9 @@ def record(tank: NonlinearTank, params: HistoryParams, plan: Plan, generator: to
     steady_y, steady_u = torch.tensor(tank.steady.controlled), torch.tensor(tank.steady.manipulated)
     x = torch.zeros(1, tank.n_states, dtype=torch.float64)
     low, high = (torch.tensor(bound, dtype=torch.float64) for bound in (params.input_low, params.input_high))
-    pid = pi_controller(params, plan.set_point[0], tank.sampling_time)
+    none = (0.0,) * tank.n_inputs
+    gains = GainParams.model_construct(proportional=params.proportional, integral=params.integral, derivative=none)
+    pid = PID(gains, plan.set_point[0], tank.sampling_time)
     memory = pid.start(1, n_samples, generator)
     u = held = torch.zeros(1, tank.n_inputs, dtype=torch.float64)
     rows: list[Tensor] = []
@@ -116,7 +111,6 @@ def spoil(table: pd.DataFrame, n_faults: int, seed: int) -> pd.DataFrame:
         return [slice(first, first + length - 1) for first in rng.integers(100, len(table) - 100, n_faults)]
 
     measured = [f"{loop}.PV" for loop in LOOPS]
-    numbers = table.select_dtypes("number").columns
     for place in rows(1):
         tag = rng.choice(measured)
         spoilt.loc[place, tag] += 12 * table[tag].std() * rng.choice([-1, 1])
@@ -126,9 +120,8 @@ def spoil(table: pd.DataFrame, n_faults: int, seed: int) -> pd.DataFrame:
     for place in rows(1):
         spoilt.loc[place, "TIME"] += sampling * rng.uniform(0.1, 0.3)
     text = spoilt.astype(object)
-    decimals = {column: 4 if column.startswith(LOOPS[0]) else 3 for column in numbers}
-    for column, places in decimals.items():
-        text[column] = [f"{value:.{places}f}" for value in spoilt[column]]
+    for column in table.select_dtypes("number"):
+        text[column] = spoilt[column].map(("{:.4f}" if column.startswith(LOOPS[0]) else "{:.3f}").format)
     text["TIME"] = spoilt["TIME"].dt.strftime("%Y-%m-%dT%H:%M:%S.%f").str[:-5]
     for place in rows(2):
         text.loc[place, rng.choice(measured)] = BAD

@@ -121,25 +121,21 @@ def _comes_near(clean: CleanRecords, variable: ControlledVariable, band: float, 
     """
     usable = clean.table["segment"] >= 0
     aim, key = f"that of the task, {variable.set_point:g} {variable.unit}", f"'set_point' of '{variable.name}'"
-
-    def near(tag: str, within: float) -> tuple[bool, float, float]:
-        values = clean.table.loc[usable, tag]
-        return bool((abs(values - variable.set_point) <= within).any()), float(values.min()), float(values.max())
-
     moves = False
     if variable.set_point_tag is not None:
-        known, low, high = near(variable.set_point_tag, band)
-        moves = high - low > band
-        if not known:
-            found = f"lie between {low:g} and {high:g}" if moves else f"stay at {low:g}"
+        values = clean.table.loc[usable, variable.set_point_tag]
+        moves = bool(values.max() - values.min() > band)
+        if not (abs(values - variable.set_point) <= band).any():
+            found = f"lie between {values.min():g} and {values.max():g}" if moves else f"stay at {values.min():g}"
             raise InputError(
                 f"{data}: column '{variable.set_point_tag}': the set points {found}, none is {aim}: change {key}, "
                 f"and give 'error_scale' where it equals 'steady_state'"
             )
-    reached, low, high = near(variable.tag, abs(variable.scale) / 2)
-    if not reached:
+    values = clean.table.loc[usable, variable.tag]
+    if not (abs(values - variable.set_point) <= abs(variable.scale) / 2).any():
         raise InputError(
-            f"{data}: column '{variable.tag}': lies between {low:g} and {high:g}, never near the set point, {aim}: change {key}"
+            f"{data}: column '{variable.tag}': lies between {values.min():g} and {values.max():g}, never near the set point, {aim}: "
+            f"change {key}"
         )
     return moves
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 import torch
+from scipy.signal import lfilter
 from torch import Tensor
 
 from helpers.own_plant.tank import HistoryParams, NonlinearTank, load_tank
@@ -52,10 +53,8 @@ class Plan:
                 by_hand[first : first + 4 * length] = (params.manual_move * span * moves).repeat_interleave(length, 0)
         keep = 1 - 1 / params.drift_time  # an Ornstein-Uhlenbeck process, sample by sample
         kicks = torch.randn(n_samples, generator=generator, dtype=torch.float64) * (1 - keep**2) ** 0.5
-        drift = torch.zeros(n_samples, dtype=torch.float64)
-        for t in range(1, n_samples):
-            drift[t] = keep * drift[t - 1] + params.drift * kicks[t]
-        return cls(targets, by_hand, drift)
+        kicks[0] = 0
+        return cls(targets, by_hand, torch.tensor(lfilter([params.drift], [1, -keep], kicks)))
 
 
 def record(tank: NonlinearTank, params: HistoryParams, plan: Plan, generator: torch.Generator) -> pd.DataFrame:

@@ -134,8 +134,8 @@ def _comes_near(clean: CleanRecords, variable: ControlledVariable, band: float, 
     values = clean.table.loc[usable, variable.tag]
     if not (abs(values - variable.set_point) <= abs(variable.scale) / 2).any():
         raise InputError(
-            f"{data}: column '{variable.tag}': lies between {values.min():g} and {values.max():g}, never near the set point, {aim}: "
-            f"change {key}"
+            f"{data}: column '{variable.tag}': lies between {values.min():g} and {values.max():g}, never near the set point, "
+            f"{aim}: change {key}"
         )
     return moves
 

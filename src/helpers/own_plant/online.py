@@ -48,28 +48,16 @@ class Improvement:
     """What the episodes of the plant brought.
 
     Attributes:
-        policy: the one to go on with. taken: whether it is the new one. episodes: of the plant, all told.
-        worse: share of the exploring episodes with a greater mean |e| than the record's PID on the same draws.
-        before, after: mean |e| of the old and the new policy on fresh episodes, as shares of the record's PID's. p_value: of the
-            one-sided paired test that the new one is better.
+        policy: the one to go on with. taken: whether it is the new one.
+        before, after: mean |e| of the old and the new policy on fresh episodes, as shares of the record's PID's.
+        words: all of it in a sentence.
     """
 
     policy: TrackingPolicy
     taken: bool
-    episodes: int
-    worse: float
     before: float
     after: float
-    p_value: float
-
-    @property
-    def words(self) -> str:
-        """In a sentence."""
-        return (
-            f"{self.episodes} episodes of the plant: {100 * self.worse:.0f} % of the exploring ones worse than the record's PID; "
-            f"the policy learned after them {'takes over' if self.taken else 'does not take over'} ({100 * self.after:.0f} against "
-            f"{100 * self.before:.0f} % of the record's PID's mean |e| in a paired test, p = {self.p_value:.2g})"
-        )
+    words: str
 
 
 def from_rest(process: Process, set_point: Tensor, load: Tensor, generator: torch.Generator) -> Scenarios:
@@ -113,8 +101,13 @@ def improve_on_plant(workshop: Workshop, identified: Identified, policy: Trackin
     p_value = float(ttest_rel(after.numpy(), before.numpy(), alternative="less").pvalue)
     allowed = plant.params.policy.movement * moved[0].double().mean().item()
     taken = p_value < params.level and moved[2].double().mean().item() <= allowed
-    shares = before.mean().item(), after.mean().item()
-    return Improvement(new if taken else policy, taken, params.explore + 2 * params.test, worse, *shares, p_value)
+    old, since = before.mean().item(), after.mean().item()
+    words = (
+        f"{params.explore + 2 * params.test} episodes of the plant: {100 * worse:.0f} % of the exploring ones worse than the "
+        f"record's PID; the policy learned after them {'takes over' if taken else 'does not take over'} ({100 * since:.0f} against "
+        f"{100 * old:.0f} % of the record's PID's mean |e| in a paired test, p = {p_value:.2g})"
+    )
+    return Improvement(new if taken else policy, taken, old, since, words)
 
 
 def at_set_points(workshop: Workshop, process: Process, candidates: Mapping[str, Tracker], n_repeats: int) -> pd.DataFrame:

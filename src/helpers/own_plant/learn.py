@@ -83,14 +83,10 @@ class OwnPlant:
         base, own = self.base, self.params.learning
         unit = tuple((own.error_unit * task.error_scale.abs()).tolist())
         names = {"controlled": self.controlled, "manipulated": self.manipulated, "sampling_time": self.description.sampling_time}
-        params = replace(
-            base,
-            process=base.process.model_copy(update=names),
-            features=base.features.model_copy(update={"features_on": "y"}),
-            learning=base.learning.model_copy(update={"policy": base.learning.policy.model_copy(update={"error_unit": unit})}),
-            case=base.case.model_copy(update={"offline": base.case.offline.model_copy(update={"epochs": own.offline_epochs})}),
-        )
-        return Study(params=params, scale_params=self.scale, seed=self.seed, case="own plant", own=(process, task))
+        policy = base.learning.policy.model_copy(update={"error_unit": unit})
+        params = replace(base, learning=base.learning.model_copy(update={"policy": policy}))
+        study = Study(params=params, scale_params=self.scale, seed=self.seed, case="own plant", own=(process, task))
+        return study.varied(process=names, features={"features_on": "y"}, offline={"epochs": own.offline_epochs})
 
 
 def open_plant(path: Path, params_root: Path, scale: str, seed: int, params: Params | None = None) -> OwnPlant:

@@ -1,8 +1,16 @@
 """A made-up plant of any size under feedback, with its historian file and its description, for the tests of one's own plant."""
 
+import re
+
 import numpy as np
 import pandas as pd
+import pytest
 from ruamel.yaml import YAML
+
+from helpers.own_plant.description import load_description
+from helpers.own_plant.quality import examine
+from helpers.own_plant.records import PlantDataError, read_records
+from helpers.own_plant.settings import load_own_plant
 
 HORIZON, HOLD = 12, 20
 
@@ -58,6 +66,22 @@ class MadeUpPlant:
         with (folder / "plant.yaml").open("w") as file:
             YAML().dump(content, file)
         return folder / "plant.yaml"
+
+    def examined(self, folder, root, table=None, **changes):
+        """The clean record of what `write` writes, its description, and the settings of its repair."""
+        path = self.write(folder, table, **changes)
+        description, params = load_description(path), load_own_plant(root).quality
+        return examine(read_records(path.parent / description.data, description), description, params), description, params
+
+
+def refusal(action, *arguments, **changes):
+    """The one sentence by which a file is refused; it names the file."""
+    with pytest.raises(PlantDataError) as caught:
+        action(*arguments, **changes)
+    sentence = str(caught.value)
+    assert re.search(r"plant\.\w+: ", sentence)
+    assert "\n" not in sentence
+    return sentence
 
 
 class Loop:

@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.own_plant.description import load_description
 from helpers.own_plant.episodes import episodes, stretches
-from helpers.own_plant.quality import examine
-from helpers.own_plant.records import read_records
-from helpers.own_plant.settings import load_own_plant
 from helpers.settings.leaf import InputError
 from tests.own_plant.plants import HOLD, HORIZON, MadeUpPlant
 
@@ -18,9 +14,7 @@ CYCLES = 15
 @pytest.fixture
 def cut(tmp_path, root):
     def found(plant, table=None, **changes):
-        path = plant.write(tmp_path, table, **changes)
-        description, params = load_description(path), load_own_plant(root).quality
-        clean = examine(read_records(tmp_path / description.data, description), description, params)
+        clean, description, params = plant.examined(tmp_path, root, table, **changes)
         return clean, description, episodes(clean, description, params, torch.float64)
 
     return found
@@ -53,21 +47,12 @@ def test_episodes_that_a_gap_an_operator_or_a_new_set_point_spoils_do_not_count(
     assert found.trajectories.n_trajectories == CYCLES - 3
 
 
-def test_a_loop_whose_set_point_stays_needs_a_scale_and_is_cut_into_windows(cut):
-    plant = MadeUpPlant(1, 1, CYCLES)
-    still = plant.content["controlled"][0] | {"set_point": float(plant.steady_y[0]), "error_scale": 0.5}
-    table = plant.table.assign(**{"Y0.SP": plant.steady_y[0]})
-    _, _, found = cut(plant, table, controlled=[still])
-    assert found.trajectories.n_trajectories == 2 * HOLD * CYCLES // (HORIZON + 1)
-    without = {key: value for key, value in still.items() if key != "error_scale"}
-    with pytest.raises(InputError, match="give 'error_scale'"):
-        cut(plant, table, controlled=[without])
-
-
 def test_too_few_episodes_are_refused_with_the_reasons(cut):
     plant = MadeUpPlant(2, 2, CYCLES)
     with pytest.raises(InputError, match=r"plant\.csv: 0 episodes of 12 samples .* expected 10 or more; left out: 15 cut short"):
         cut(plant, plant.table[(plant.table.index % HOLD < 5) | (plant.table.index % HOLD > 14)])
+    with pytest.raises(InputError, match=r"plant\.csv: 0 episodes of 100 samples .* left out: 1 cut short"):
+        cut(plant, plant.table.iloc[: 2 * HOLD], horizon=100)  # a record shorter than an episode
 
 
 def loop(plant, **changes):
@@ -77,44 +62,38 @@ def loop(plant, **changes):
 def test_a_record_that_never_comes_near_the_task_is_refused_with_the_range_that_it_has(cut):
     plant = MadeUpPlant(1, 1, CYCLES)
     low, high = (f"{value:g}" for value in (plant.steady_y[0], plant.steady_y[0] + plant.set_point[0]))
-    found = (
-        rf"plant\.csv: column 'Y0\.SP': the set points lie between {low} and {high}, none is .* 80 %: change 'set_point' of 'y0'"
-    )
-    with pytest.raises(InputError, match=found):
-        cut(plant, controlled=loop(plant, set_point=80.0))
-    with pytest.raises(
-        InputError, match=r"plant\.csv: column 'Y0\.PV': lies between 49.* never near the set point, .* 80 %: change"
+    for changes, says in (
+        (
+            {"set_point": 80.0},
+            rf"'Y0\.SP': the set points lie between {low} and {high}, none is .* 80 %: change 'set_point' of 'y0'",
+        ),
+        ({"set_point": 80.0, "set_point_tag": None}, r"'Y0\.PV': lies between 49.* never near the set point, .* 80 %: change"),
+        ({"steady_state": 40.0}, rf"0 episodes .* left out: .* {CYCLES} not from 'steady_state'"),
     ):
-        cut(plant, controlled=loop(plant, set_point=80.0, set_point_tag=None))
-    with pytest.raises(InputError, match=rf"0 episodes .* left out: .* {CYCLES} not from 'steady_state'"):
-        cut(plant, controlled=loop(plant, steady_state=40.0))
+        with pytest.raises(InputError, match=rf"plant\.csv: .*{says}"):
+            cut(plant, controlled=loop(plant, **changes))
 
 
 def test_a_record_whose_set_point_never_moves_gives_stretches_or_says_where_it_stays(cut):
     plant = MadeUpPlant(1, 1, CYCLES)
     table = plant.table.assign(**{"Y0.SP": 50.0})
-    with pytest.raises(
-        InputError, match=r"'Y0\.SP': the set points stay at 50, none is .*: change 'set_point' of 'y0', .*'error_scale'"
-    ):
+    says = r"'Y0\.SP': the set points stay at 50, none is .*: change 'set_point' of 'y0', .*'error_scale'"
+    with pytest.raises(InputError, match=says):
         cut(plant, table)
-    _, _, found = cut(plant, table, controlled=loop(plant, set_point=50.0, steady_state=48.0))
-    assert found.trajectories.n_trajectories == 2 * HOLD * CYCLES // (HORIZON + 1)
+    for still in ({"steady_state": 48.0}, {"error_scale": 0.5}):
+        _, _, found = cut(plant, table, controlled=loop(plant, set_point=50.0, **still))
+        assert found.trajectories.n_trajectories == 2 * HOLD * CYCLES // (HORIZON + 1)
+    with pytest.raises(InputError, match="give 'error_scale'"):
+        cut(plant, table, controlled=loop(plant, set_point=50.0))
     with pytest.raises(InputError, match=r"6 episodes of 99 samples at the set point of the task, expected 10"):
         cut(plant, table, controlled=loop(plant, set_point=50.0, steady_state=48.0), horizon=99)
 
 
-def test_a_record_shorter_than_an_episode_is_refused_with_the_reasons(cut):
-    plant = MadeUpPlant(2, 2, CYCLES)
-    with pytest.raises(InputError, match=r"plant\.csv: 0 episodes of 100 samples .* left out: 1 cut short"):
-        cut(plant, plant.table.iloc[: 2 * HOLD], horizon=100)
-
-
 def test_after_a_break_the_input_before_is_the_first_of_the_episode(cut):
     plant = MadeUpPlant(1, 1, CYCLES)
-    still = plant.content["controlled"][0] | {"set_point": float(plant.steady_y[0]), "error_scale": 0.5}
-    table = plant.table.assign(**{"Y0.SP": plant.steady_y[0]})
+    table = plant.table.assign(**{"Y0.SP": 50.0})
     table.loc[100:129, "U0.OP"] = np.nan
-    _, _, found = cut(plant, table, controlled=[still])
+    _, _, found = cut(plant, table, controlled=loop(plant, set_point=50.0, error_scale=0.5))
     assert found.before.isfinite().all()
     inputs = table["U0.OP"].to_numpy() - plant.steady_u
     episode = found.starts.index(130 + 2)

@@ -103,46 +103,39 @@ def test_a_bad_measurement_is_held_then_the_pid_takes_the_loops_that_are_left(de
     assert inputs[1] > before[1] + 0.05  # the error is about one, and the integral gain 0.2 per second
 
 
-def test_the_policy_comes_back_after_enough_good_measurements_without_a_jump(description):
+GOOD, BAD, STUCK = (), ((0, np.nan),), ((0, 50.5),)
+
+
+@pytest.mark.parametrize(
+    ("samples", "modes"),
+    [
+        pytest.param([BAD, GOOD, GOOD, GOOD], "hhpp", id="a short fault never reaches the PID"),
+        pytest.param([BAD] * 8 + [GOOD] * 2, "hhhPPPPPPp", id="the policy comes back after enough good measurements"),
+        pytest.param([STUCK] * 10, "pppppphhhP", id="a sensor that does not move is stale"),
+        pytest.param([BAD, GOOD] * 6 + [GOOD, GOOD, BAD], "hhhhhhPPPPPPpph", id="one that comes and goes reaches the PID"),
+        pytest.param([BAD] * 3 + ["manual", BAD], "hhhmh", id="after a phase in manual the count begins anew"),
+    ],
+)
+def test_who_sets_the_inputs_and_the_policy_comes_back_without_a_jump(description, samples, modes):
     guard, measured = in_automatic(description)
-    for _ in range(8):
-        guard.step(measured((1, np.nan)), SET_POINT)
-    u = guard.u.copy()
-    guard.step(measured(), SET_POINT)
-    assert guard.mode == Mode.PID
-    returned = guard.step(measured(), SET_POINT)
-    assert guard.mode == Mode.POLICY
-    assert np.abs(returned - u).max() < 0.5
-    assert in_automatic(description)[0].mode == Mode.POLICY
+    for changes, mode in zip(samples, modes, strict=True):
+        before = guard.u.copy()
+        if changes == "manual":
+            guard.follow(measured(), SET_POINT, guard.u)
+        else:
+            guard.step(measured(*changes), SET_POINT)
+        assert guard.mode != Mode.POLICY or np.abs(guard.u - before).max() < 0.5
+        assert guard.mode == {"m": Mode.MANUAL, "p": Mode.POLICY, "h": Mode.HOLD, "P": Mode.PID}[mode]
 
 
-def test_a_short_fault_never_reaches_the_pid(description):
-    guard, measured = in_automatic(description)
-    guard.step(measured((0, np.nan)), SET_POINT)
-    modes = [(guard.step(measured(), SET_POINT), guard.mode)[1] for _ in range(3)]
-    assert modes == [Mode.HOLD, Mode.POLICY, Mode.POLICY]
-
-
-def test_a_sensor_that_does_not_move_is_stale(description):
-    guard, measured = in_automatic(description)
-    modes = [(guard.step(measured((0, 50.5)), SET_POINT), guard.mode)[1] for _ in range(LIMITS.stale + LIMITS.hold + 1)]
-    assert modes[: LIMITS.stale] == [Mode.POLICY] * LIMITS.stale
-    assert modes[LIMITS.stale :] == [Mode.HOLD] * LIMITS.hold + [Mode.PID]
-
-
-def test_a_policy_that_fails_is_replaced_too(description):
-    guard, measured = in_automatic(description)
-    guard.policy.asked[0] = np.nan
-    modes = [(guard.step(measured(), SET_POINT), guard.mode)[1] for _ in range(LIMITS.hold + 1)]
-    assert modes == [Mode.HOLD] * LIMITS.hold + [Mode.PID]
-    assert np.isfinite(guard.u).all()
-
-
-def test_without_a_pid_the_inputs_stay_held(description):
-    guard, measured = in_automatic(description.model_copy(update={"pid": ()}))
+@pytest.mark.parametrize("proportional", [None, np.nan], ids=["no PID", "a PID that fails"])
+def test_without_a_sound_pid_the_inputs_stay_held(description, proportional):
+    loops = [loop.model_copy(update={"proportional": proportional}) for loop in description.pid if proportional]
+    guard, measured = in_automatic(description.model_copy(update={"pid": tuple(loops)}))
     before = guard.u.copy()
     for _ in range(20):
         inputs = guard.step(measured((0, np.nan)), SET_POINT)
+    assert guard.mode == Mode.PID
     assert inputs == pytest.approx(before)
 
 
@@ -199,40 +192,6 @@ def test_an_operator_s_input_that_is_no_number_is_not_followed(description):
     assert np.isfinite(guard.policy.memory).all()
 
 
-def test_a_pid_that_fails_leaves_the_inputs_where_they_are(description):
-    broken = tuple(loop.model_copy(update={"proportional": np.nan}) for loop in description.pid)
-    guard, measured = in_automatic(description.model_copy(update={"pid": broken}))
-    before = guard.u.copy()
-    for _ in range(LIMITS.hold + 5):
-        guard.step(measured((0, np.nan)), SET_POINT)
-    assert guard.mode == Mode.PID
-    assert guard.u == pytest.approx(before)
-
-
-def test_a_sensor_that_comes_and_goes_reaches_the_pid(description):
-    guard, measured = in_automatic(description)
-    before, modes = guard.u.copy(), []
-    for sample in range(4 * LIMITS.hold):
-        guard.step(measured((0, np.nan)) if sample % 2 == 0 else measured(), SET_POINT)
-        modes.append(guard.mode)
-    assert modes == [Mode.HOLD] * 2 * LIMITS.hold + [Mode.PID] * 2 * LIMITS.hold
-    assert guard.u[1] > before[1] + 0.05  # the other loop works
-    for _ in range(LIMITS.healthy):
-        guard.step(measured(), SET_POINT)
-    assert guard.mode == Mode.POLICY
-    guard.step(measured((0, np.nan)), SET_POINT)
-    assert guard.mode == Mode.HOLD  # and the count begins anew
-
-
-def test_after_a_phase_in_manual_the_count_begins_anew(description):
-    guard, measured = in_automatic(description)
-    for _ in range(LIMITS.hold):
-        guard.step(measured((0, np.nan)), SET_POINT)
-    guard.follow(measured(), SET_POINT, guard.u)
-    guard.step(measured((0, np.nan)), SET_POINT)
-    assert guard.mode == Mode.HOLD
-
-
 class Noted(Asking):
     """A policy with the notes of its file."""
 
@@ -244,6 +203,11 @@ class Noted(Asking):
         self.notes |= notes
 
 
+def first(**changes):
+    """The first manipulated variable changed."""
+    return lambda d: {"manipulated": (d.manipulated[0].model_copy(update=changes), d.manipulated[1])}
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -251,20 +215,10 @@ class Noted(Asking):
         (lambda d: {"time_unit": "min"}, "'sampling_time' in s is 2.0 in the policy and 120.0"),
         (lambda d: {"controlled": d.controlled[:1]}, "the number of 'controlled' variables is 2 in the policy and 1"),
         (lambda d: {"controlled": d.controlled[::-1]}, "'name' of 'y1' is y0 in the policy and y1"),
-        *(
-            (
-                lambda d, key=key, other=other: {
-                    "manipulated": (d.manipulated[0].model_copy(update={key: other}), d.manipulated[1])
-                },
-                says,
-            )
-            for key, other, says in (
-                ("tag", "U9.OP", "'tag' of 'u0' is U0.OP in the policy and U9.OP in the description"),
-                ("unit", "kg/h", "'unit' of 'u0' is % in the policy and kg/h in the description"),
-                ("high", 30.0, "'high' of 'u0' is 23.0 in the policy and 30.0 in the description"),
-                ("steady_state", 19.0, "'steady_state' of 'u0' is 20.0 in the policy and 19.0 in the description"),
-            )
-        ),
+        (first(tag="U9.OP"), "'tag' of 'u0' is U0.OP in the policy and U9.OP in the description"),
+        (first(unit="kg/h"), "'unit' of 'u0' is % in the policy and kg/h in the description"),
+        (first(high=30.0), "'high' of 'u0' is 23.0 in the policy and 30.0 in the description"),
+        (first(steady_state=19.0), "'steady_state' of 'u0' is 20.0 in the policy and 19.0 in the description"),
     ],
 )
 def test_a_policy_under_a_description_that_is_not_its_own_is_refused(description, change, says):
@@ -275,18 +229,19 @@ def test_a_policy_under_a_description_that_is_not_its_own_is_refused(description
     assert says in str(caught.value)
 
 
-@pytest.mark.parametrize("failure", ["raises", "returns another shape"])
+@pytest.mark.parametrize("failure", ["raises", "returns another shape", "returns no number"])
 def test_a_policy_that_cannot_run_falls_back_like_a_bad_measurement(description, failure):
     guard, measured = in_automatic(description)
 
     def broken(y, set_point, u_previous):
         if failure == "raises":
             raise RuntimeError("onnxruntime")
-        return np.zeros((1, 7))
+        return np.zeros((1, 7)) if failure == "returns another shape" else np.array([[np.nan, 23.0]])
 
     sound, guard.policy.step = guard.policy.step, broken
     modes = [(guard.step(measured(), SET_POINT), guard.mode)[1] for _ in range(LIMITS.hold + 1)]
     assert modes == [Mode.HOLD] * LIMITS.hold + [Mode.PID]
+    assert np.isfinite(guard.u).all()
     guard.follow(measured(), SET_POINT, guard.u)
     guard.policy.step = sound
     guard.step(measured(), SET_POINT)

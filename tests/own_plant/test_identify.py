@@ -30,11 +30,14 @@ def params(root):
     return load_own_plant(root).identification.model_copy(update=quick)
 
 
-def found(channels, gains, params, **record):
-    y, u = Loop(channels, gains).record(**record)
-    scales = np.ones(len(channels)), np.ones(len(channels[0]))
-    names = [f"y{i}" for i in range(len(channels))], [f"u{j}" for j in range(len(channels[0]))]
-    return identify(hold_out([Stretch(y, u)], 0.25), scales, names, params, members=8, seed=0)
+def modelled(parts, params, members=8):
+    n_y, n_u = parts[0][0].y.shape[1], parts[0][0].u.shape[1]
+    names = [f"y{i}" for i in range(n_y)], [f"u{j}" for j in range(n_u)]
+    return identify(parts, (np.ones(n_y), np.ones(n_u)), names, params, members, seed=0)
+
+
+def found(channels, gains, params):
+    return modelled(hold_out([Stretch(*Loop(channels, gains).record())], 0.25), params)
 
 
 def gain(equation):
@@ -152,14 +155,14 @@ def test_a_disturbance_that_grows_with_the_deviation_is_told_from_a_fixed_one(pa
         for t in range(1, 3000):
             mean = 0.9 * y[t - 1, 0] + 0.2 * u[t - 1, 0]
             y[t] = mean + size(mean) * rng.normal()
-        model = identify(hold_out([Stretch(y, u)], 0.25), (np.ones(1), np.ones(1)), (["y"], ["u"]), params, 4, 0)
+        model = modelled(hold_out([Stretch(y, u)], 0.25), params, members=4)
         assert model.equations[0].spread == pytest.approx(expected, abs=0.035)
 
 
 def test_what_the_data_cannot_carry_is_said(params):
     y, u = Loop([[(*FIRST, 1)]], [(0.3, 0.03)]).record()
     idle = np.column_stack([u, 0.1 * np.random.default_rng(0).normal(size=len(u))])
-    model = identify(hold_out([Stretch(y, idle)], 0.25), (np.ones(1), np.ones(2)), (["y"], ["u0", "u1"]), params, 4, 0)
+    model = modelled(hold_out([Stretch(y, idle)], 0.25), params, members=4)
     assert model.warnings == ("the data do not tell an effect of u1 on any output from none",)
     good = validate_model(model, [Stretch(y, idle)], 30, ["y"], params)
     assert good.fit[0] > 0.8
@@ -169,7 +172,7 @@ def test_what_the_data_cannot_carry_is_said(params):
     assert "unexplained: too much to learn from" in validate_model(model, noise, 30, ["y"], params).warnings[0]
     short = [Stretch(y[:20], idle[:20])]
     with pytest.raises(InputError, match="no stretch of the record is longer than"):
-        identify((short, short), (np.ones(1), np.ones(2)), (["y"], ["u0", "u1"]), params, 4, 0)
+        modelled((short, short), params)
 
 
 def test_the_last_part_is_held_out_and_a_long_record_thinned_out():

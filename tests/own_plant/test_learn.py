@@ -18,12 +18,6 @@ from helpers.report import plant_report
 from helpers.runs.sources import PROJECT
 from tests.own_plant.plants import HORIZON, MadeUpPlant
 
-QUICK = {
-    "identification": {"orders": (1, 2), "longest_dead_time": 2},
-    "rivals": {"penalties": (1.0, 100.0), "episodes": 16},
-    "gate": {"models": 10, "episodes": 2},
-    "online": {"explore": 8, "test": 6},
-}
 FILES = {
     "learning.yaml": (
         ("epoch_share: {value: 0.05,", "epoch_share: {value: 0.02,"),
@@ -35,17 +29,10 @@ FILES = {
         ("longest_dead_time: {value: 10,", "longest_dead_time: {value: 2,"),
         ("penalties: {value: [0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0],", "penalties: {value: [1.0, 100.0],"),
         ("models: {value: 150,", "models: {value: 20,"),
+        ("explore: {value: 60,", "explore: {value: 8,"),
+        ("test: {value: 60,", "test: {value: 6,"),
     ),
 }
-
-
-def small(plant):
-    """A few epochs and steps with a few episodes: enough to see that everything fits together."""
-    learning = plant.base.learning
-    learning = learning.model_copy(update={"policy": learning.policy.model_copy(update={"hidden_cells": (6, 6)})})
-    scale = plant.scale.model_copy(update={"episodes": 16, "measured": 4, "epoch_share": 0.02})
-    parts = {name: getattr(plant.params, name).model_copy(update=changes) for name, changes in QUICK.items()}
-    return replace(plant, scale=scale, base=replace(plant.base, learning=learning), params=plant.params.model_copy(update=parts))
 
 
 @pytest.fixture
@@ -61,10 +48,19 @@ def quick_root(root, tmp_path):
     return folder
 
 
+@pytest.fixture
+def opened(tmp_path, quick_root):
+    """A made-up plant with so many outputs and inputs, opened: enough epochs, steps and episodes to see that all fits together."""
+
+    def made_up(n_y, n_u, table=None, **changes):
+        return learn.open_plant(MadeUpPlant(n_y, n_u).write(tmp_path, table, **changes), quick_root, "smoke", 0)
+
+    return made_up
+
+
 @pytest.mark.parametrize(("n_y", "n_u"), [(1, 1), (3, 2), pytest.param(2, 3, marks=pytest.mark.torture)])
-def test_the_whole_chain_runs_for_any_number_of_variables(n_y, n_u, tmp_path, root):
-    path = MadeUpPlant(n_y, n_u).write(tmp_path)
-    plant = small(learn.open_plant(path, root, "smoke", 0))
+def test_the_whole_chain_runs_for_any_number_of_variables(n_y, n_u, tmp_path, opened):
+    plant = opened(n_y, n_u)
     identified, validation = learn.identify_plant(plant)
     assert (validation.fit > 0.5).all()
     model = identified.nominal.to(plant.dtype)
@@ -85,9 +81,9 @@ def test_the_whole_chain_runs_for_any_number_of_variables(n_y, n_u, tmp_path, ro
     assert notes["set_point_range"][0] == pytest.approx([50.0, max(50.0, 50.0 + MadeUpPlant(n_y, n_u).set_point[0])])
 
 
-def test_the_features_are_those_of_the_record_and_on_y(tmp_path, root):
-    plant = learn.open_plant(MadeUpPlant(2, 2).write(tmp_path), root, "smoke", 0)
-    found, task = plant.demonstrations, plant.task(torch.zeros(2), torch.zeros(2))
+def test_the_features_are_those_of_the_record_and_on_y(opened):
+    plant = opened(2, 2)
+    found, task = plant.demonstrations, plant.description.task(torch.zeros(2), torch.zeros(2), plant.dtype)
     features = plant.study(None, task).features
     assert features.params.features_on == "y"
     assert found.trajectories.y.shape[0] == HORIZON + 1
@@ -95,8 +91,8 @@ def test_the_features_are_those_of_the_record_and_on_y(tmp_path, root):
     assert features.errors(found.trajectories).numpy() == pytest.approx(errors.numpy())
 
 
-def test_the_task_begins_at_rest_where_the_demonstrations_began(tmp_path, root):
-    plant = small(learn.open_plant(MadeUpPlant(2, 3).write(tmp_path), root, "smoke", 0))
+def test_the_task_begins_at_rest_where_the_demonstrations_began(opened):
+    plant = opened(2, 3)
     identified, _ = learn.identify_plant(plant)
     model = identified.nominal
     task = learn.task_on(plant, model)
@@ -106,17 +102,16 @@ def test_the_task_begins_at_rest_where_the_demonstrations_began(tmp_path, root):
 
 
 @pytest.mark.parametrize("described", [True, False])
-def test_the_pid_of_the_record_is_found_in_it(described, tmp_path, root):
-    made_up = MadeUpPlant(1, 1)
-    table = made_up.table.copy()
+def test_the_pid_of_the_record_is_found_in_it(described, opened):
+    table = MadeUpPlant(1, 1).table
     error = (table["Y0.SP"] - table["Y0.PV"]).to_numpy()
     table["U0.OP"] = 20.0 + 0.5 * error + np.concatenate([[0.0], 0.03 * error[1:].cumsum()]) % 0.3
-    clean = learn.open_plant(made_up.write(tmp_path, table, pid=made_up.content["pid"] if described else []), root, "smoke", 0)
-    gains, _ = recorded_gains(clean.clean, clean.description, torch.float64)
+    plant = opened(1, 1, table, **({} if described else {"pid": []}))
+    gains, _ = recorded_gains(plant.clean, plant.description, torch.float64)
     steady = np.abs(np.diff(table["U0.OP"])) < 0.2
     assert steady.any()
     assert gains.proportional.item() == pytest.approx(0.5, rel=0.3)
-    given = described_gains(clean.description, torch.float64)
+    given = described_gains(plant.description, torch.float64)
     assert (given is not None) == described
     if described:
         assert (given.proportional.item(), given.integral.item()) == (1.0, pytest.approx(0.4))
@@ -204,13 +199,12 @@ def test_what_cannot_end_well_is_refused_before_anything_is_learned(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_few_episodes_of_the_plant_change_the_policy_only_for_a_better_one(tmp_path, root):
-    plant = small(learn.open_plant(MadeUpPlant(1, 1).write(tmp_path), root, "smoke", 0))
+def test_a_few_episodes_of_the_plant_change_the_policy_only_for_a_better_one(opened):
+    plant = opened(1, 1)
     identified, _ = learn.identify_plant(plant)
     workshop = learn.open_workshop(plant, identified)
     policy, _ = learn.learn_policy(workshop, workshop.record)
     improvement = online.improve_on_plant(workshop, identified, policy, workshop.nominal)
-    assert improvement.episodes == 20
     assert improvement.taken == (improvement.policy is not policy)
     assert improvement.words.startswith("20 episodes of the plant: ")
     assert not improvement.taken or improvement.after < improvement.before

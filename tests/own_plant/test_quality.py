@@ -5,10 +5,9 @@ import pandas as pd
 import pytest
 
 from helpers.own_plant.description import load_description
-from helpers.own_plant.quality import CONVERSIONS, examine
-from helpers.own_plant.records import PlantDataError, read_records
-from helpers.own_plant.settings import load_own_plant
-from tests.own_plant.plants import MadeUpPlant
+from helpers.own_plant.quality import CONVERSIONS
+from helpers.own_plant.records import read_records
+from tests.own_plant.plants import MadeUpPlant, refusal
 
 
 @pytest.fixture(scope="module")
@@ -18,27 +17,13 @@ def plant():
 
 @pytest.fixture
 def clean(plant, tmp_path, root):
-    def examined(table, **changes):
-        path = plant.write(tmp_path, table, **changes)
-        description = load_description(path)
-        return examine(read_records(path.parent / description.data, description), description, load_own_plant(root).quality)
-
-    return examined
+    return lambda table, **changes: plant.examined(tmp_path, root, table, **changes)[0]
 
 
 def found(clean, check, column=None):
     rows = [entry for entry in clean.findings if entry.check == check and column in (None, entry.column)]
     assert len(rows) == 1, [entry.check for entry in clean.findings]
     return rows[0]
-
-
-def refusal(action, *arguments, **changes):
-    with pytest.raises(PlantDataError) as caught:
-        action(*arguments, **changes)
-    sentence = str(caught.value)
-    assert "\n" not in sentence
-    assert "plant." in sentence
-    return sentence
 
 
 def test_a_sound_file_is_left_as_it_is(clean, plant):
@@ -49,25 +34,15 @@ def test_a_sound_file_is_left_as_it_is(clean, plant):
     assert found(after, "set point step", "Y1.SP").rows[:2] == (22, 42)  # sample 20 stands in the file's row 22
 
 
-def test_parquet_and_stamps_read_like_csv_and_numbers(clean, plant):
-    dated = plant.table.assign(TIME=pd.Timestamp("2026-03-01") + pd.to_timedelta(plant.table["TIME"], unit="s"))
+@pytest.mark.parametrize("name", ["plant.csv", "plant.parquet"])
+def test_parquet_and_stamps_with_a_zone_or_without_read_like_csv_and_numbers(clean, plant, name):
+    begin = pd.Timestamp("2026-10-25 00:50", tz="UTC")  # shortly before the clocks change
+    stamps = begin + pd.to_timedelta(plant.table["TIME"], unit="s")
+    words = stamps.dt.strftime("%Y-%m-%dT%H:%M:%S")
+    local = stamps.dt.tz_convert("Europe/Berlin")
     expected = clean(plant.table).table
-    for table, name in ((dated, "plant.csv"), (plant.table, "plant.parquet"), (dated, "plant.parquet")):
-        pd.testing.assert_frame_equal(clean(table, data=name).table, expected)
-
-
-@pytest.mark.parametrize("zone", ["Z", "+01:00"])
-def test_stamps_with_a_zone_read_like_those_without(clean, plant, zone):
-    stamps = pd.Timestamp("2026-01-05") + pd.to_timedelta(plant.table["TIME"], unit="s")
-    zoned = plant.table.assign(TIME=stamps.dt.strftime("%Y-%m-%dT%H:%M:%S") + zone)
-    pd.testing.assert_frame_equal(clean(zoned).table, clean(plant.table).table)
-
-
-def test_where_the_clocks_change_no_time_is_lost(clean, plant):
-    stamps = pd.Timestamp("2026-10-25", tz="UTC") + pd.to_timedelta(plant.table["TIME"] + 3500, unit="s")
-    local = plant.table.assign(TIME=stamps.dt.tz_convert("Europe/Berlin"))
-    for name in ("plant.csv", "plant.parquet"):
-        pd.testing.assert_frame_equal(clean(local, data=name).table, clean(plant.table).table)
+    for time in (plant.table["TIME"], stamps.dt.tz_localize(None), words + "Z", words + "+01:00", local):
+        pd.testing.assert_frame_equal(clean(plant.table.assign(TIME=time), data=name).table, expected)
 
 
 def test_words_in_the_place_of_numbers_are_filled_on_a_line(clean, plant):
@@ -83,6 +58,8 @@ def test_words_in_the_place_of_numbers_are_filled_on_a_line(clean, plant):
 def test_a_short_gap_is_filled_and_a_long_one_ends_a_stretch(clean, plant):
     after = clean(plant.table.drop(index=[30, 31, *range(100, 140)]))
     assert found(after, "short gap").count == 1
+    assert list(after.section().columns) == ["check", "column", "count", "rows", "rule"]
+    assert after.section().set_index("check").loc["short gap", "rows"] == "32"
     assert found(after, "long gap").rows == (2 + 140 - 42,)
     assert len(after.table) == len(plant.table) - 40
     assert after.table["U0.OP"][[30, 31]].tolist() == [plant.table["U0.OP"][29]] * 2  # an input is held
@@ -163,16 +140,13 @@ def test_inputs_at_bounds_and_manual_rows_are_counted_and_kept(clean, plant):
     assert not after.table["automatic"][40:50].any()
 
 
-def test_a_new_episode_ends_a_stretch(clean, plant):
-    after = clean(plant.table.assign(RUN=np.where(plant.table.index < 77, "a", "b")), episode="RUN")
-    assert after.table["segment"].diff().fillna(0).ne(0).to_numpy().nonzero()[0].tolist() == [77]
-
-
-def test_a_row_out_of_order_does_not_cut_its_episode_into_pieces(clean, plant):
+def test_a_new_episode_ends_a_stretch_and_a_row_out_of_order_does_not(clean, plant):
     table = plant.table.assign(RUN=np.where(plant.table.index < 77, "a", "b"))
-    table.iloc[[75, 80]] = table.iloc[[80, 75]].to_numpy()
-    after = clean(table, episode="RUN")
-    assert after.table["segment"].diff().fillna(0).ne(0).to_numpy().nonzero()[0].tolist() == [77]
+    late = table.copy()
+    late.iloc[[75, 80]] = late.iloc[[80, 75]].to_numpy()
+    for given in (table, late):
+        after = clean(given, episode="RUN")
+        assert after.table["segment"].diff().fillna(0).ne(0).to_numpy().nonzero()[0].tolist() == [77]
 
 
 def test_another_unit_is_named(clean, plant):
@@ -210,9 +184,3 @@ def test_what_no_rule_can_help_is_refused(clean, plant, tmp_path):
     assert "is missing" in refusal(read_records, tmp_path / "plant.txt", description)
     (tmp_path / "plant.csv").write_text("TIME,Y0.PV\n1,2,3\n", encoding="utf-8")
     assert "not readable as CSV" in refusal(read_records, tmp_path / "plant.csv", description)
-
-
-def test_the_section_names_every_finding(clean, plant):
-    section = clean(plant.table.drop(index=30)).section()
-    assert list(section.columns) == ["check", "column", "count", "rows", "rule"]
-    assert section.set_index("check").loc["short gap", "rows"] == "32"

@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 
 from helpers.own_plant.description import load_description
-from helpers.own_plant.records import PlantDataError, read_records
-from tests.own_plant.plants import MadeUpPlant
+from helpers.own_plant.records import read_records
+from tests.own_plant.plants import MadeUpPlant, refusal
 
 PLANT = MadeUpPlant(1, 1, n_cycles=15)  # 600 rows
 MINUTES = {"time_unit": "min", "sampling_time": 20.0}
@@ -21,15 +21,6 @@ def read(tmp_path):
         return read_records(tmp_path / "plant.csv", description)
 
     return found
-
-
-def refusal(action, *arguments, **changes):
-    with pytest.raises(PlantDataError) as caught:
-        action(*arguments, **changes)
-    sentence = str(caught.value)
-    assert "plant.csv: " in sentence
-    assert "\n" not in sentence
-    return sentence
 
 
 def stamped(stamps):

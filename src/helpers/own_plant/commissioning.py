@@ -1,6 +1,5 @@
 """A guarded policy stepped sample by sample on whatever stands for the plant, as it would be on the plant itself."""
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -8,7 +7,6 @@ import numpy as np
 import pandas as pd
 import torch
 
-from helpers.own_plant.description import Variable
 from helpers.own_plant.guard import Guard
 from helpers.plant.process import Process
 
@@ -36,7 +34,7 @@ def commission(guard: Guard, process: Process, trial: Trial, generator: torch.Ge
     """
     description = guard.description
     steady_y, steady_u = description.steady("controlled"), description.steady("manipulated")
-    target = np.array([variable.set_point for variable in description.controlled])
+    target, outputs = description.values("controlled", "set_point"), description.names("controlled")
     shape = (trial.n_samples, 1)
     kicks = torch.randn(*shape, process.n_disturbances, generator=generator, dtype=torch.float64)
     errors = torch.randn(*shape, process.n_outputs, generator=generator, dtype=torch.float64)
@@ -53,11 +51,7 @@ def commission(guard: Guard, process: Process, trial: Trial, generator: torch.Ge
         else:
             u = guard.step(y, set_point)
         seconds.append(perf_counter() - begin)
-        rows.append({"mode": str(guard.mode), **_named(description.controlled, y), **_named(description.manipulated, u)})
-        rows[-1] |= {f"{name}_sp": value for name, value in _named(description.controlled, set_point).items()}
+        rows.append((str(guard.mode), *y, *u, *set_point))
         x = process.step(x, torch.tensor(u)[None] - steady_u, kicks[t])
-    return pd.DataFrame(rows), seconds
-
-
-def _named(variables: Sequence[Variable], values: np.ndarray) -> Mapping[str, float]:
-    return {variable.name: float(value) for variable, value in zip(variables, values, strict=True)}
+    columns = ["mode", *outputs, *description.names("manipulated"), *(f"{name}_sp" for name in outputs)]
+    return pd.DataFrame(rows, columns=columns), seconds

@@ -33,20 +33,6 @@ class PolicyStep(nn.Module):
     deviation is taken before anything is rounded.
     """
 
-    proportional: Tensor
-    integral: Tensor
-    derivative: Tensor
-    kept: Tensor
-    unit: Tensor
-    centre: Tensor
-    reach: Tensor
-    low: Tensor
-    high: Tensor
-    steady_y: Tensor
-    steady_u: Tensor
-    output_weight: Tensor
-    output_bias: Tensor
-
     def __init__(self, policy: TrackingPolicy, steady_y: Tensor, steady_u: Tensor) -> None:
         super().__init__()
         self.cells = list(policy.params.hidden_cells)
@@ -67,34 +53,30 @@ class PolicyStep(nn.Module):
     def forward(self, y: Tensor, set_point: Tensor, u_previous: Tensor, *memory: Tensor) -> tuple[Tensor, ...]:
         """The input to apply, (K, n_u), and the memory for the next sample, as in `memory_names`."""
         once, excess, quick, *states = memory
-        error = set_point - y
-        middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
-        scaled = SHARPNESS * error / self.unit
+        of, error = dict(self.named_buffers()), set_point - y
+        low, high = of["low"], of["high"]
+        middle, half = (high + low) / 2, (high - low) / 2
+        scaled = SHARPNESS * error / of["unit"]
         sharp = torch.sign(scaled) * torch.log(scaled.abs() + torch.sqrt(scaled**2 + 1))  # asinh, which not every runtime has
-        last = u_previous - self.steady_u
-        seen = [sharp, (set_point - self.steady_y - self.centre) / self.reach, (last - middle) / half]
+        last = u_previous - of["steady_u"]
+        seen = [sharp, (set_point - of["steady_y"] - of["centre"]) / of["reach"], (last - middle) / half]
         signal = torch.cat(seen, dim=-1).float()
         after: list[Tensor] = []
         for index, width in enumerate(self.cells):
             hidden, cell = states[2 * index], states[2 * index + 1]
-            weight, bias = getattr(self, f"weight_{index}"), getattr(self, f"bias_{index}")
-            gates = functional.linear(torch.cat([signal, hidden], dim=-1), weight, bias)
+            gates = functional.linear(torch.cat([signal, hidden], dim=-1), of[f"weight_{index}"], of[f"bias_{index}"])
             entry, forget, candidate, exit_ = gates.split(width, dim=-1)
             cell = torch.sigmoid(forget) * cell + torch.sigmoid(entry) * torch.tanh(candidate)
             hidden = torch.sigmoid(exit_) * torch.tanh(cell)
             after += [hidden, cell]
             signal = functional.leaky_relu(hidden, self.slope)
-        correction = functional.linear(signal, self.output_weight, self.output_bias).double() * half
-        integral = last + self.kept * excess - quick + error @ self.integral.T
+        correction = functional.linear(signal, of["output_weight"], of["output_bias"]).double() * half
+        integral = last + of["kept"] * excess - quick + error @ of["integral"].T
         if not self.patient:
-            integral = self.within(integral)
-        quick = error @ self.proportional.T + (error - once) @ self.derivative.T + correction
-        u = self.within(integral + quick)
-        return (u + self.steady_u, error, integral + quick - u, quick, *after)
-
-    def within(self, command: Tensor) -> Tensor:
-        """Clipped to the bounds of the inputs."""
-        return torch.minimum(torch.maximum(command, self.low), self.high)
+            integral = torch.minimum(torch.maximum(integral, low), high)
+        quick = error @ of["proportional"].T + (error - once) @ of["derivative"].T + correction
+        u = torch.minimum(torch.maximum(integral + quick, low), high)
+        return (u + of["steady_u"], error, integral + quick - u, quick, *after)
 
 
 def memory_names(policy: TrackingPolicy) -> list[str]:

@@ -3,26 +3,26 @@
 Unlike the parameter files it has no sources and statuses: its author knows the plant.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, Strict, model_validator
-from pydantic_core import PydanticCustomError
 from torch import Tensor
 
 from helpers.plant.task import ControlTask
-from helpers.settings.leaf import Count, NotZero, Positive, Real, Record, Text, read_yaml, validate
+from helpers.settings.leaf import Count, NotZero, Positive, Real, Record, Text, read_yaml, refusal, validate
 
+Kind = Literal["controlled", "manipulated"]
 SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 RESERVED = ("row", "clock", "run", "automatic", "segment")  # columns that the table of a record has beside those of the tags
 
 
 def _free(tag: str) -> str:
     if tag in RESERVED:
-        own = {"own": ", ".join(RESERVED)}
-        raise PydanticCustomError("reserved", "expected a tag other than the program's own columns ({own})", own)
+        raise refusal(f"expected a tag other than the program's own columns ({', '.join(RESERVED)})")
     return tag
 
 
@@ -30,7 +30,7 @@ def _encoding(name: str) -> str:
     try:
         "".encode(name)
     except (LookupError, ValueError) as error:
-        raise PydanticCustomError("encoding", "expected an encoding such as utf-8, latin-1 or cp1252") from error
+        raise refusal("expected an encoding such as utf-8, latin-1 or cp1252") from error
     return name
 
 
@@ -52,9 +52,9 @@ class Variable(Record):
     @model_validator(mode="after")
     def _in_range(self) -> Self:
         if not self.low < self.high:
-            raise PydanticCustomError("range", "'low' must lie below 'high'")
+            raise refusal("'low' must lie below 'high'")
         if not self.low <= self.steady_state <= self.high:
-            raise PydanticCustomError("range", "'steady_state' lies outside 'low' to 'high'")
+            raise refusal("'steady_state' lies outside 'low' to 'high'")
         return self
 
 
@@ -71,7 +71,7 @@ class ControlledVariable(Variable):
     @model_validator(mode="after")
     def _scaled(self) -> Self:
         if self.error_scale is None and self.set_point == self.steady_state:
-            raise PydanticCustomError("scale", "'set_point' equals 'steady_state', so the error has no scale: give 'error_scale'")
+            raise refusal("'set_point' equals 'steady_state', so the error has no scale: give 'error_scale'")
         return self
 
     @property
@@ -84,6 +84,11 @@ class ManipulatedVariable(Variable):
     """An input between its bounds. `rate` is the greatest move from one sample to the next, if there is one."""
 
     rate: Positive | None = None
+
+    @property
+    def fastest(self) -> float:
+        """The rate, infinite where there is none."""
+        return np.inf if self.rate is None else self.rate
 
 
 class LoopGains(Record):
@@ -129,55 +134,69 @@ class PlantDescription(Record):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        names = [variable.name for variable in (*self.controlled, *self.manipulated)]
-        tags = [tag for tag in self.columns if tag is not None]
-        for kind, words in (("name", names), ("tag", tags)):
-            doubled = next((word for word in words if words.count(word) > 1), None)
-            if doubled is not None:
-                raise PydanticCustomError("double", "the {kind} '{word}' occurs twice", {"kind": kind, "word": doubled})
-        outputs, inputs = ([variable.name for variable in known] for known in (self.controlled, self.manipulated))
+        outputs, inputs = self.names("controlled"), self.names("manipulated")
+        for kind, words in (("name", outputs + inputs), ("tag", self.columns)):
+            if doubled := [word for word in words if words.count(word) > 1]:
+                raise refusal(f"the {kind} '{doubled[0]}' occurs twice")
         for loop in self.pid:
             for key, name, known in (("controlled", loop.controlled, outputs), ("manipulated", loop.manipulated, inputs)):
                 if name not in known:
-                    found: dict[str, Any] = {"key": key, "name": name}
-                    raise PydanticCustomError("pid", "'pid' names the {key} variable '{name}', which is not described", found)
+                    raise refusal(f"'pid' names the {key} variable '{name}', which is not described")
         for name, value in self.transfer.items():
-            aimed = next((variable for variable in self.controlled if variable.name == name), None)
-            if aimed is None:
-                raise PydanticCustomError("transfer", "'transfer' names '{name}', which is no controlled variable", {"name": name})
+            if name not in outputs:
+                raise refusal(f"'transfer' names '{name}', which is no controlled variable")
+            aimed = self.controlled[outputs.index(name)]
             if not aimed.low <= value <= aimed.high:
-                raise PydanticCustomError("transfer", "'transfer' takes '{name}' outside 'low' to 'high'", {"name": name})
+                raise refusal(f"'transfer' takes '{name}' outside 'low' to 'high'")
         return self
 
     @property
     def columns(self) -> tuple[str, ...]:
         """Every column of the file that is used."""
-        numbers = (*(v.tag for v in self.controlled), *(v.tag for v in self.manipulated))
-        return tuple(c for c in (self.time, self.episode, self.mode, *numbers, *self.set_point_tags) if c is not None)
+        names = (self.time, self.episode, self.mode)
+        return (*(name for name in names if name is not None), *self.tags)
+
+    @property
+    def tags(self) -> tuple[str, ...]:
+        """Those that hold numbers."""
+        return (*(variable.tag for variable in (*self.controlled, *self.manipulated)), *self.set_point_tags)
 
     @property
     def set_point_tags(self) -> tuple[str, ...]:
         """The columns of the set points, of those loops that have one."""
         return tuple(variable.set_point_tag for variable in self.controlled if variable.set_point_tag is not None)
 
-    def steady(self, kind: Literal["controlled", "manipulated"], dtype: torch.dtype = torch.float64) -> Tensor:
+    @property
+    def loops(self) -> list[tuple[int, int, LoopGains]]:
+        """The PID loops with the places of the variables that they measure and move."""
+        outputs, inputs = self.names("controlled"), self.names("manipulated")
+        return [(outputs.index(loop.controlled), inputs.index(loop.manipulated), loop) for loop in self.pid]
+
+    def names(self, kind: Kind) -> tuple[str, ...]:
+        """Of all variables of a kind."""
+        return tuple(variable.name for variable in getattr(self, kind))
+
+    def values(self, kind: Kind, key: str) -> NDArray[np.float64]:
+        """One number of every variable of a kind, (n_y,) or (n_u,)."""
+        return np.array([getattr(variable, key) for variable in getattr(self, kind)])
+
+    def steady(self, kind: Kind, dtype: torch.dtype = torch.float64) -> Tensor:
         """y_ss or u_ss in engineering units, shape (n_y,) or (n_u,)."""
-        variables: Sequence[Variable] = self.controlled if kind == "controlled" else self.manipulated
-        return torch.tensor([variable.steady_state for variable in variables], dtype=dtype)
+        return torch.tensor(self.values(kind, "steady_state"), dtype=dtype)
 
     def task(self, initial_mean: Tensor, initial_std: Tensor, dtype: torch.dtype) -> ControlTask:
         """The control task in deviation variables from the steady state; the initial state is that of the model."""
 
-        def tensor(values: list[float]) -> Tensor:
-            return torch.tensor(values, dtype=dtype)
+        def deviation(kind: Kind, key: str) -> Tensor:
+            return torch.tensor(self.values(kind, key) - self.values(kind, "steady_state"), dtype=dtype)
 
         return ControlTask(
-            set_point=tensor([variable.set_point - variable.steady_state for variable in self.controlled]),
-            error_scale=tensor([variable.scale for variable in self.controlled]),
+            set_point=deviation("controlled", "set_point"),
+            error_scale=torch.tensor(self.values("controlled", "scale"), dtype=dtype),
             initial_mean=initial_mean.to(dtype),
             initial_std=initial_std.to(dtype),
-            input_low=tensor([variable.low - variable.steady_state for variable in self.manipulated]),
-            input_high=tensor([variable.high - variable.steady_state for variable in self.manipulated]),
+            input_low=deviation("manipulated", "low"),
+            input_high=deviation("manipulated", "high"),
             n_steps=self.horizon,
         )
 

@@ -26,6 +26,9 @@ class Stretch:
     def __len__(self) -> int:
         return len(self.y)
 
+    def __getitem__(self, part: slice) -> "Stretch":
+        return Stretch(self.y[part], self.u[part])
+
 
 @dataclass(frozen=True)
 class Episodes:
@@ -54,10 +57,8 @@ def signals(clean: CleanRecords, description: PlantDescription) -> tuple[Array, 
 def stretches(clean: CleanRecords, description: PlantDescription, shortest: int) -> list[Stretch]:
     """Every stretch of at least `shortest` samples, whoever was in control."""
     y, u = signals(clean, description)
-    segment = clean.table["segment"].to_numpy()
-    edges = np.flatnonzero(np.diff(segment)) + 1
-    pieces = zip(np.split(segment, edges), np.split(y, edges), np.split(u, edges), strict=True)
-    return [Stretch(outputs, inputs) for number, outputs, inputs in pieces if number[0] >= 0 and len(number) >= shortest]
+    runs = _runs(clean.table["segment"].to_numpy())
+    return [Stretch(y[first:end], u[first:end]) for first, end in runs if end - first >= shortest]
 
 
 def episodes(clean: CleanRecords, description: PlantDescription, params: QualityParams, dtype: torch.dtype) -> Episodes:
@@ -78,17 +79,16 @@ def episodes(clean: CleanRecords, description: PlantDescription, params: Quality
     described = any(variable.set_point != variable.steady_state for variable in description.controlled if variable.set_point_tag)
     moving = described and any(moved)
     segment, automatic = table["segment"].to_numpy(), table["automatic"].to_numpy()
-    counted = np.stack([segment >= 0, automatic, at_task]).astype(np.int64)
-    totals = np.concatenate([np.zeros((3, 1), dtype=np.int64), counted.cumsum(1)], axis=1)
-    length = n_steps + 1
-    last = len(table) - length
-    arrives = at_task[1:] & ~at_task[:-1]
-    first = np.flatnonzero(arrives & came_from[:-1]) + 1 if moving else _windows(segment, at_task & automatic, length)
-    fits = first <= last
-    within = np.where(fits, first, 0)
-    end = np.minimum(within + length, len(table))  # of a record shorter than an episode, which fits nowhere
-    whole, hands_off, held = totals[:, end] - totals[:, within] == length
-    whole &= fits & (segment[within] == segment[end - 1])
+    length, arrives = n_steps + 1, at_task[1:] & ~at_task[:-1]
+    if moving:
+        first = np.flatnonzero(arrives & came_from[:-1]) + 1
+    else:
+        runs = _runs(np.where(at_task & automatic, segment, -1))
+        first = np.array([start for begin, end in runs for start in range(begin, end - length + 1, length)], dtype=int)
+    samples = np.minimum(first[:, None] + np.arange(length), len(table) - 1)
+    pieces, fits = segment[samples], first + length <= len(table)
+    whole = fits & (pieces >= 0).all(1) & (pieces[:, 0] == pieces[:, -1])
+    hands_off, held = automatic[samples].all(1), at_task[samples].all(1)
     left_out = {
         "cut short by a break": int((~whole).sum()),
         "not in automatic": int((whole & ~hands_off).sum()),
@@ -104,9 +104,8 @@ def episodes(clean: CleanRecords, description: PlantDescription, params: Quality
             f"{params.fewest_episodes} or more; left out: {words} (keys 'horizon', 'set_point', 'steady_state')"
         )
     y, u = signals(clean, description)
-    index = starts[None, :] + np.arange(length)[:, None]
-    outputs = torch.tensor(y[index], dtype=dtype)
-    inputs = torch.tensor(u[index[:-1]], dtype=dtype)
+    index = starts + np.arange(length)[:, None]
+    outputs, inputs = torch.tensor(y[index], dtype=dtype), torch.tensor(u[index[:-1]], dtype=dtype)
     previous = np.maximum(starts - 1, 0)
     # Before a break the input is not known, or was another: the first of the episode stands for it.
     before = torch.tensor(u[np.where(segment[previous] == segment[starts], previous, starts)], dtype=dtype)
@@ -122,25 +121,21 @@ def _comes_near(clean: CleanRecords, variable: ControlledVariable, band: float, 
     """
     usable = clean.table["segment"] >= 0
     aim, key = f"that of the task, {variable.set_point:g} {variable.unit}", f"'set_point' of '{variable.name}'"
-
-    def near(tag: str, within: float) -> tuple[bool, float, float]:
-        values = clean.table.loc[usable, tag]
-        return bool((abs(values - variable.set_point) <= within).any()), float(values.min()), float(values.max())
-
     moves = False
     if variable.set_point_tag is not None:
-        known, low, high = near(variable.set_point_tag, band)
-        moves = high - low > band
-        if not known:
-            found = f"lie between {low:g} and {high:g}" if moves else f"stay at {low:g}"
+        values = clean.table.loc[usable, variable.set_point_tag]
+        moves = bool(values.max() - values.min() > band)
+        if not (abs(values - variable.set_point) <= band).any():
+            found = f"lie between {values.min():g} and {values.max():g}" if moves else f"stay at {values.min():g}"
             raise InputError(
                 f"{data}: column '{variable.set_point_tag}': the set points {found}, none is {aim}: change {key}, "
                 f"and give 'error_scale' where it equals 'steady_state'"
             )
-    reached, low, high = near(variable.tag, abs(variable.scale) / 2)
-    if not reached:
+    values = clean.table.loc[usable, variable.tag]
+    if not (abs(values - variable.set_point) <= abs(variable.scale) / 2).any():
         raise InputError(
-            f"{data}: column '{variable.tag}': lies between {low:g} and {high:g}, never near the set point, {aim}: change {key}"
+            f"{data}: column '{variable.tag}': lies between {values.min():g} and {values.max():g}, never near the set point, "
+            f"{aim}: change {key}"
         )
     return moves
 
@@ -158,9 +153,7 @@ def _set_points(clean: CleanRecords, description: PlantDescription, params: Qual
     return at_task, came_from
 
 
-def _windows(segment: NDArray, usable: NDArray, length: int) -> NDArray:
-    """First samples of windows of some length, one after the other, within every usable piece."""
-    pieces = np.where(usable, segment, -1)
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(pieces)) + 1, [len(pieces)]])
-    found = [np.arange(first, last - length + 1, length) for first, last in pairwise(edges) if pieces[first] >= 0]
-    return np.concatenate(found) if found else np.zeros(0, dtype=int)
+def _runs(numbers: NDArray) -> list[tuple[int, int]]:
+    """First sample and end of every run of the same number, those of negative ones left out."""
+    edges = [0, *(np.flatnonzero(np.diff(numbers)) + 1), len(numbers)]
+    return [(first, end) for first, end in pairwise(edges) if numbers[first] >= 0]

@@ -66,29 +66,23 @@ class Guard:
     limits: GuardLimits = field(default_factory=GuardLimits)
 
     def __post_init__(self) -> None:
-        controlled, manipulated = self.description.controlled, self.description.manipulated
+        title, values, n_y = self.description.title, self.description.values, len(self.description.controlled)
         notes = getattr(self.policy, "notes", {})
         if differences := _differences(notes, self.description):
-            raise InputError(f"{self.description.title}: the policy was made for another description: {'; '.join(differences)}")
-        slack = LAST_DIGIT * np.array([variable.high - variable.low for variable in controlled])
-        self.trained = np.array(notes.get("set_point_range", [(-np.inf, np.inf)] * len(controlled)), dtype=float).T
-        self.trained = np.stack([self.trained[0] - slack, self.trained[1] + slack])
-        self.low = np.array([variable.low for variable in manipulated])
-        self.high = np.array([variable.high for variable in manipulated])
-        self.rate = np.array([np.inf if variable.rate is None else variable.rate for variable in manipulated])
-        self.possible = np.array([(variable.low, variable.high) for variable in controlled]).T
-        names = [variable.name for variable in controlled], [variable.name for variable in manipulated]
-        self.loops = [(names[0].index(loop.controlled), names[1].index(loop.manipulated), loop) for loop in self.description.pid]
-        used = [loop[1] for loop in self.loops]
-        if len(set(used)) < len(used):
-            raise InputError(f"{self.description.title}: key 'pid': two loops set the same manipulated variable")
+            raise InputError(f"{title}: the policy was made for another description: {'; '.join(differences)}")
+        if len({index for _, index, _ in self.description.loops}) < len(self.description.pid):
+            raise InputError(f"{title}: key 'pid': two loops set the same manipulated variable")
+        self.possible = values("controlled", "low"), values("controlled", "high")
+        slack = LAST_DIGIT * (self.possible[1] - self.possible[0])
+        least, greatest = np.array(notes.get("set_point_range", [(-np.inf, np.inf)] * n_y), dtype=float).T
+        self.trained = least - slack, greatest + slack
+        self.low, self.high, self.rate = (values("manipulated", key) for key in ("low", "high", "fastest"))
         self.running: dict[int, PID] = {}
         self.mode = Mode.MANUAL
-        self.u = np.array([variable.steady_state for variable in manipulated])
-        self.offset = np.zeros(len(manipulated))
-        self.set_point = np.full(len(controlled), np.nan)  # the last that was a number
-        self.last = np.full(len(controlled), np.nan)
-        self.repeats = np.zeros(len(controlled), dtype=int)
+        self.u = values("manipulated", "steady_state")
+        self.offset = np.zeros(len(self.u))
+        self.set_point, self.last = np.full((2, n_y), np.nan)  # the last that was a number; the last measurement
+        self.repeats = np.zeros(n_y, dtype=int)
         self.n_bad = self.n_good = 0
         self.policy.reset()
 
@@ -120,8 +114,7 @@ class Guard:
         command = np.where(np.isfinite(command), command, self.u)  # an input that is no number would never become one again
         # Whoever takes over begins where the inputs are; the difference to what it asks for fades.
         self.offset = np.where(fresh, self.u - command, self.offset * np.exp(-1 / self.limits.fade))
-        command = command + self.offset
-        moved = np.clip(command, self.u - self.rate, self.u + self.rate)
+        moved = np.clip(command + self.offset, self.u - self.rate, self.u + self.rate)
         self.u = np.clip(moved, self.low, self.high)
         return self.u.copy()
 
@@ -164,7 +157,7 @@ class Guard:
         if begins:
             self.running.clear()
         command, fresh = self.u.copy(), np.ones(len(self.u), dtype=bool)
-        for output, index, loop in self.loops:
+        for output, index, loop in self.description.loops:
             if not good[output]:
                 self.running.pop(index, None)
                 continue
@@ -172,8 +165,9 @@ class Guard:
             if fresh[index]:
                 limits = (self.low[index], self.high[index])
                 gains = (loop.proportional, loop.integral, loop.derivative)
-                pid = self.running[index] = PID(*gains, sample_time=None, output_limits=limits, auto_mode=False)
-                pid.set_auto_mode(True, last_output=self.u[index] - loop.proportional * (self.set_point[output] - y[output]))
+                self.running[index] = PID(*gains, sample_time=None, output_limits=limits, auto_mode=False)
+                left = self.u[index] - loop.proportional * (self.set_point[output] - y[output])
+                self.running[index].set_auto_mode(True, last_output=left)
             pid = self.running[index]
             pid.setpoint = self.set_point[output]
             command[index] = pid(y[output], dt=self.description.sampling_time)
@@ -193,17 +187,13 @@ def _differences(notes: Mapping[str, Any], description: PlantDescription) -> lis
         compare("'title'", notes["title"], description.title)
     if "sampling_time" in notes:
         time, unit = notes["sampling_time"]
-        own = description.sampling_time * SECONDS[description.time_unit]
-        compare("'sampling_time' in s", time * SECONDS[unit], own)
-    kinds: dict[str, tuple[Variable, ...]] = {"controlled": description.controlled, "manipulated": description.manipulated}
-    for kind, variables in kinds.items():
-        noted = notes.get(kind, [])
-        if kind in notes:
-            compare(f"the number of '{kind}' variables", len(noted), len(variables))
-        for entry, variable in zip(noted, variables, strict=False):
-            for key in NOTED:
-                if key in entry:
-                    compare(f"'{key}' of '{variable.name}'", entry[key], getattr(variable, key))
+        compare("'sampling_time' in s", time * SECONDS[unit], description.sampling_time * SECONDS[description.time_unit])
+    for kind in [kind for kind in ("controlled", "manipulated") if kind in notes]:
+        variables: tuple[Variable, ...] = getattr(description, kind)
+        compare(f"the number of '{kind}' variables", len(notes[kind]), len(variables))
+        for entry, variable in zip(notes[kind], variables, strict=False):
+            for key in [key for key in NOTED if key in entry]:
+                compare(f"'{key}' of '{variable.name}'", entry[key], getattr(variable, key))
     if "set_point_range" in notes:
         compare("the shape of 'set_point_range'", np.shape(notes["set_point_range"]), (len(description.controlled), 2))
     return found

@@ -7,8 +7,8 @@ greatest likelihood on records held out. The uncertainty is an ensemble: the sam
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
 from itertools import product
 
 import numpy as np
@@ -60,12 +60,14 @@ class Equation:
     spread: Array
 
     @property
+    def free(self) -> Array:
+        """The free coefficients of A."""
+        return self.parameters[: self.structure.n_own]
+
+    @property
     def own(self) -> Array:
         """a_1..a_n of y_t = a_1 y_{t-1} + .., the pole at one included, shape (n,)."""
-        free = self.parameters[: self.structure.n_own]
-        if not self.structure.integrating:
-            return free
-        return -np.convolve([1.0, -1.0], np.concatenate([[1.0], -free]))[1:]
+        return -np.convolve([1.0, -1.0], np.r_[1.0, -self.free])[1:] if self.structure.integrating else self.free
 
     @property
     def inputs(self) -> Array:
@@ -86,49 +88,40 @@ class Equation:
     @property
     def growth(self) -> float:
         """The largest modulus among the free poles."""
-        free = self.parameters[: self.structure.n_own]
-        return float(np.abs(np.roots(np.concatenate([[1.0], -free]))).max(initial=0.0))
+        return float(np.abs(np.roots(np.r_[1.0, -self.free])).max(initial=0.0))
 
 
 def hold_out(pieces: Sequence[Stretch], share: float) -> tuple[list[Stretch], list[Stretch]]:
     """The first part of a record to identify from and the last to judge by; the stretch in between is cut in two."""
-    left = round((1 - share) * sum(len(piece) for piece in pieces))
-    first: list[Stretch] = []
-    last: list[Stretch] = []
+    left, first, last = round((1 - share) * sum(map(len, pieces))), [], []
     for piece in pieces:
         part = min(max(left, 0), len(piece))
-        first += [Stretch(piece.y[:part], piece.u[:part])] if part > 1 else []
-        last += [Stretch(piece.y[part:], piece.u[part:])] if len(piece) - part > 1 else []
+        first.append(piece[:part])
+        last.append(piece[part:])
         left -= len(piece)
-    return first, last
+    return [piece for piece in first if len(piece) > 1], [piece for piece in last if len(piece) > 1]
 
 
 def thin_out(pieces: Sequence[Stretch], longest: int, length: int) -> list[Stretch]:
     """At most about `longest` samples: pieces of `length` spread evenly over a longer record."""
-    total = sum(len(piece) for piece in pieces)
-    if total <= longest:
+    if sum(map(len, pieces)) <= longest:
         return list(pieces)
-    cut = [
-        Stretch(piece.y[first : first + length], piece.u[first : first + length])
-        for piece in pieces
-        for first in range(0, len(piece) - 1, length)
-    ]
+    cut = [piece[first : first + length] for piece in pieces for first in range(0, len(piece) - 1, length)]
     return [cut[int(index)] for index in np.linspace(0, len(cut) - 1, max(1, longest // length))]
 
 
-def lagged(signal: Array, lag: int) -> Array:
-    """A signal some samples ago; before the record its first value stands for what is not known."""
-    return signal[np.maximum(np.arange(len(signal)) - lag, 0)]
+def lagged(signal: Array, lag: int, fill: float | None = None) -> Array:
+    """A signal some samples ago; before the record its first value stands for what is not known, or `fill`."""
+    return np.concatenate([np.full(lag, signal[0] if fill is None else fill), signal])[: len(signal)]
 
 
 def stable_zeros(coefficients: Array) -> Array:
     """C(q) with its zeros inside the unit circle: those outside are mirrored, which leaves the spectrum as it was."""
-    roots = np.roots(np.concatenate([[1.0], coefficients]))
+    roots = np.roots(np.r_[1.0, coefficients])
     size = np.abs(roots)
     inside = np.where(size > 1, roots / np.maximum(size, 1e-12) ** 2, roots)
     inside = inside * np.minimum(1, FARTHEST / np.maximum(np.abs(inside), 1e-12))
-    polynomial = np.real(np.poly(inside))[1:]
-    return np.concatenate([polynomial, np.zeros(len(coefficients) - len(polynomial))])
+    return np.real(np.poly(inside))[1:]
 
 
 class Record:
@@ -142,7 +135,6 @@ class Record:
     def __init__(self, pieces: Sequence[tuple[Array, Array]], first: int) -> None:
         self.first = max(first, LONG)
         self.pieces = [piece for piece in pieces if len(piece[0]) > 2 * self.first]
-        self.length = sum(len(piece[0]) - self.first for piece in self.pieces)
 
     @classmethod
     def of(cls, pieces: Sequence[Stretch], output: int, scales: tuple[Array, Array], params: PlantIdentificationParams) -> "Record":
@@ -166,8 +158,8 @@ class Record:
     def errors(self, structure: Structure, parameters: Array) -> list[Array]:
         """One-step prediction errors of each stretch; the first ones of a stretch start from innovations of zero."""
         n = structure.order
-        linear, c = parameters[:-n], np.concatenate([[1.0], parameters[-n:]])
-        return [lfilter([1.0], c, target - past @ linear) for target, past in self.regression(structure)]
+        c = np.r_[1.0, parameters[-n:]]
+        return [lfilter([1.0], c, target - past @ parameters[:-n]) for target, past in self.regression(structure)]
 
     def starts(self, structure: Structure) -> list[Array]:
         """First parameters: after Hannan and Rissanen (1982), with the residuals of a long autoregression as innovations; then with
@@ -176,14 +168,13 @@ class Record:
         regression, n = self.regression(structure), structure.order
         long = self.regression(Structure(LONG, structure.dead_times, structure.integrating))
         coefficients = _least_squares(long)
-        rows = []
-        for (target, past), (late, far) in zip(regression, long, strict=True):
-            e = late - far @ coefficients
-            rows.append((target, np.column_stack([past, *(_before(e, lag) for lag in range(1, n + 1))])))
-        first = _least_squares(rows)
-        plain = _least_squares(regression)
-        own = Equation(structure, np.concatenate([plain, np.zeros(n)]), np.ones(2)).own
-        found = [first, np.concatenate([plain, -own]), np.concatenate([plain, np.zeros(n)])]
+        rows = [
+            (target, _with_innovations(past, late - far @ coefficients, n))
+            for (target, past), (late, far) in zip(regression, long, strict=True)
+        ]
+        white = np.r_[_least_squares(regression), np.zeros(n)]
+        own = Equation(structure, white, np.ones(2)).own
+        found = [_least_squares(rows), np.r_[white[:-n], -own], white]
         for parameters in found:
             parameters[-n:] = stable_zeros(parameters[-n:])
         return found
@@ -193,10 +184,13 @@ class Record:
         if start is None:
             fits = [self.fit(structure, first, weights, steps) for first in self.starts(structure)]
             return min(fits, key=lambda found: sum(float((e**2).sum()) for e in self.errors(structure, found)))
-        parameters = start
-        n = structure.order
-        root = np.ones(self.length) if weights is None else weights**0.5
-        best = self._cost(structure, parameters, root)
+        parameters, n = start, structure.order
+        root = np.ones(1) if weights is None else weights**0.5
+
+        def cost_of(trial: Array) -> float:
+            return float(((root * np.concatenate(self.errors(structure, trial))) ** 2).sum())
+
+        best = cost_of(parameters)
         for _ in range(steps):
             errors, slopes = self.linearised(structure, parameters)
             step = _solve(root[:, None] * slopes, root * errors)
@@ -204,7 +198,7 @@ class Record:
             while share > 1e-2:
                 trial = parameters + share * step
                 trial[-n:] = stable_zeros(trial[-n:])
-                cost = self._cost(structure, trial, root)
+                cost = cost_of(trial)
                 if cost < best:
                     break
                 share /= 2
@@ -217,22 +211,22 @@ class Record:
 
     def linearised(self, structure: Structure, parameters: Array) -> tuple[Array, Array]:
         """All one-step errors, (N,), and their slopes in the parameters with the sign changed, (N, p)."""
-        n = structure.order
-        linear, c = parameters[:-n], np.concatenate([[1.0], parameters[-n:]])
-        errors, slopes = [], []
-        for target, past in self.regression(structure):
-            e = lfilter([1.0], c, target - past @ linear)
-            errors.append(e)
-            tail = [_before(e, lag) for lag in range(1, n + 1)]
-            slopes.append(lfilter([1.0], c, np.column_stack([past, *tail]), axis=0))
+        errors, c = self.errors(structure, parameters), np.r_[1.0, parameters[-structure.order :]]
+        slopes = [
+            lfilter([1.0], c, _with_innovations(past, e, structure.order), axis=0)
+            for (_, past), e in zip(self.regression(structure), errors, strict=True)
+        ]
         return np.concatenate(errors), np.concatenate(slopes)
 
-    def _cost(self, structure: Structure, parameters: Array, root: Array) -> float:
-        return float(((root * np.concatenate(self.errors(structure, parameters))) ** 2).sum())
+    def covariance(self, structure: Structure, parameters: Array) -> Array:
+        """Of the parameters that were fitted, (p, p)."""
+        errors, slopes = self.linearised(structure, parameters)
+        return np.var(errors) * np.linalg.pinv(slopes.T @ slopes)
 
 
-def _before(e: Array, lag: int) -> Array:
-    return np.concatenate([np.zeros(lag), e])[: len(e)]
+def _with_innovations(past: Array, e: Array, order: int) -> Array:
+    """The regressors and the innovations 1..n samples ago, zero before the record."""
+    return np.column_stack([past, *(lagged(e, lag, 0.0) for lag in range(1, order + 1))])
 
 
 def _least_squares(rows: Sequence[tuple[Array, Array]]) -> Array:
@@ -247,41 +241,27 @@ def _solve(past: Array, target: Array) -> Array:
     return np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(len(size)), scaled.T @ target) / size
 
 
-def likelihood(errors: Sequence[Array], variance: float) -> Array:
-    """Log density of one-step errors, (N,), normal with this variance."""
-    e = np.concatenate(errors)
-    return -(e**2 / variance + np.log(2 * np.pi * variance)) / 2
-
-
 def dead_times(record: Record, order: int, integrating: bool, start: tuple[int, ...], longest: int) -> tuple[int, ...]:
     """The dead times with the least squared errors, input by input until none changes."""
-    found = start
-    known: dict[tuple[int, ...], float] = {}
 
+    @cache
     def cost(trial: tuple[int, ...]) -> float:
-        if trial not in known:
-            structure = Structure(order, trial, integrating)
-            fitted = record.fit(structure, record.starts(structure)[0], steps=1)
-            known[trial] = float(sum((e**2).sum() for e in record.errors(structure, fitted)))
-        return known[trial]
+        structure = Structure(order, trial, integrating)
+        fitted = record.fit(structure, record.starts(structure)[0], steps=1)
+        return float(sum((e**2).sum() for e in record.errors(structure, fitted)))
 
-    while True:
+    found, before = start, None
+    while found != before:
         before = found
         for j in range(len(found)):
             found = min(((*found[:j], dead, *found[j + 1 :]) for dead in range(longest + 1)), key=cost)
-        if found == before:
-            return found
+    return found
 
 
-def choose(
-    training: Record, held_out: Record, n_inputs: int, params: PlantIdentificationParams
-) -> tuple[Structure, dict[Structure, float]]:
+def choose(training: Record, held_out: Record, n_inputs: int, params: PlantIdentificationParams) -> Structure:
     """The simplest structure whose likelihood on held-out records is within one standard error of the greatest.
 
     Of those the simplest with white residuals, if there is one.
-
-    Returns:
-        It, and the mean log likelihood per sample of every candidate.
     """
     values: dict[Structure, Array] = {}
     for integrating in (False, True):
@@ -292,19 +272,17 @@ def choose(
             fitted = training.fit(structure)
             if Equation(structure, fitted, np.ones(2)).growth < 1:  # nothing is learned on an unstable model
                 variance = float(np.mean(np.concatenate(training.errors(structure, fitted)) ** 2))
-                values[structure] = likelihood(held_out.errors(structure, fitted), variance)
+                e = np.concatenate(held_out.errors(structure, fitted))
+                values[structure] = -(e**2 / variance + np.log(2 * np.pi * variance)) / 2  # the log of a normal density
     if not values:
         raise InputError("no stable model describes the record")
-    best = max(values.values(), key=lambda value: float(value.mean()))
-
-    def good(value: Array) -> bool:
-        lost = best - value
-        return bool(lost.mean() <= lost.std() / len(lost) ** 0.5)
-
-    fine = sorted((s for s, value in values.items() if good(value)), key=lambda s: s.n_own + s.order)
-    fine = [s for s in fine if not s.integrating or ramps(training, s)] or [max(values, key=lambda s: float(values[s].mean()))]
+    best = max(values, key=lambda s: float(values[s].mean()))
+    lost = {s: values[best] - value for s, value in values.items()}
+    good = [s for s, less in lost.items() if less.mean() <= less.std() / len(less) ** 0.5]
+    simplest_first = sorted(good, key=lambda s: s.n_own + s.order)
+    fine = [s for s in simplest_first if not s.integrating or ramps(training, s)] or [best]
     white = [s for s in fine if whiteness(training.errors(s, training.fit(s)), params) >= params.white]
-    return (white or fine)[0], {s: float(value.mean()) for s, value in values.items()}
+    return (white or fine)[0]
 
 
 def whiteness(errors: Sequence[Array], params: PlantIdentificationParams) -> float:
@@ -314,10 +292,8 @@ def whiteness(errors: Sequence[Array], params: PlantIdentificationParams) -> flo
 
 def ramps(record: Record, structure: Structure) -> bool:
     """Whether some input sets the rate of an integrating output: the sum of its coefficients is no chance."""
-    parameters = record.fit(structure)
-    errors, slopes = record.linearised(structure, parameters)
-    covariance = np.var(errors) * np.linalg.pinv(slopes.T @ slopes)
-    n = structure.order
+    parameters, n = record.fit(structure), structure.order
+    covariance = record.covariance(structure, parameters)
     first = [structure.n_own + n * j for j in range(len(structure.dead_times))]
     ratios = [parameters[k : k + n].sum() / covariance[k : k + n, k : k + n].sum() ** 0.5 for k in first]
     return max(np.abs(ratios)) > TOLD
@@ -353,23 +329,20 @@ def slowed(coefficients: Array, time: float) -> Array:
 
     Roots on the negative axis belong to no time constant and stay.
     """
-    roots = np.roots(np.concatenate([[1.0], -coefficients])).astype(complex)
+    roots = np.roots(np.r_[1.0, -coefficients]).astype(complex)
     moved = np.where((np.abs(roots.imag) > 1e-9) | (roots.real > 0), roots ** (1 / time), roots)
-    polynomial = -np.real(np.atleast_1d(np.poly(moved)))[1:]
-    return np.concatenate([polynomial, np.zeros(len(coefficients) - len(polynomial))])
+    return -np.real(np.atleast_1d(np.poly(moved)))[1:]
 
 
 def apart(equation: Equation, margins: Margins) -> Equation:
     """The equation of a plant that is as far from the identified one as the margins say."""
-    structure, n = equation.structure, equation.structure.order
-    free = equation.parameters[: structure.n_own]
-    own = slowed(free, margins.time)
-    speed = (1 - own.sum()) / (1 - free.sum())
+    own = slowed(equation.free, margins.time)
+    speed = (1 - own.sum()) / (1 - equation.free.sum())
     inputs = equation.inputs * speed * margins.gain[:, None]
     zeros = -slowed(-equation.innovations, margins.time)
-    dead = tuple(known + more for known, more in zip(structure.dead_times, margins.dead_time, strict=True))
-    parameters = np.concatenate([own, inputs.ravel(), [equation.constant * speed], zeros])
-    return Equation(Structure(n, dead, structure.integrating), parameters, equation.spread)
+    dead = tuple(known + more for known, more in zip(equation.structure.dead_times, margins.dead_time, strict=True))
+    parameters = np.r_[own, inputs.ravel(), equation.constant * speed, zeros]
+    return Equation(replace(equation.structure, dead_times=dead), parameters, equation.spread)
 
 
 def assemble(plants: Sequence[Sequence[Equation]], scales: tuple[Array, Array]) -> ArmaxModel:
@@ -390,14 +363,8 @@ def assemble(plants: Sequence[Sequence[Equation]], scales: tuple[Array, Array]) 
             constant[m, i] = equation.constant * y_scale[i]
             spread[m, i] = equation.spread * (y_scale[i], 1.0)
     flat = [array.reshape(len(plants), n_y, -1) for array in (own, inputs[:, :, 1:], innovations)]
-    return ArmaxModel(
-        window=torch.tensor(np.concatenate(flat, axis=-1)),
-        entry=torch.tensor(inputs[:, :, 0]),
-        constant=torch.tensor(constant),
-        spread=torch.tensor(spread),
-        lags=lags,
-        taps=taps,
-    )
+    window, entry = torch.tensor(np.concatenate(flat, axis=-1)), torch.tensor(inputs[:, :, 0])
+    return ArmaxModel(window, entry, torch.tensor(constant), torch.tensor(spread), lags, taps)
 
 
 @dataclass(frozen=True)
@@ -407,7 +374,6 @@ class Identified:
     Attributes:
         equations: the fitted equation of each output. nominal: the model of them. members: those of each member of the ensemble.
         scales: of outputs and inputs, in whose units the equations stand.
-        candidates: of each output, the mean log likelihood per held-out sample by structure.
         warnings: what the data cannot carry, in sentences.
     """
 
@@ -415,7 +381,6 @@ class Identified:
     nominal: ArmaxModel
     members: tuple[tuple[Equation, ...], ...]
     scales: tuple[Array, Array]
-    candidates: tuple[dict[Structure, float], ...]
     warnings: tuple[str, ...]
 
     def ensemble(self, margins: MarginParams, n_models: int, seed: int, at_ends: float = 0.0) -> ArmaxModel:
@@ -462,27 +427,26 @@ def identify(
         InputError: if no stretch is long enough, or no stable model describes the record.
     """
     n_u, rng = len(scales[1]), np.random.default_rng(seed)
-    equations, ensembles, candidates, warnings = [], [], [], []
+    equations, ensembles, warnings = [], [], []
     told = np.zeros(n_u, dtype=bool)
     for i, name in enumerate(names[0]):
         training, held_out = (Record.of(pieces, i, scales, params) for pieces in parts)
         if not (training.pieces and held_out.pieces):
             raise InputError(f"no stretch of the record is longer than {2 * training.first} samples, so no model can be identified")
-        structure, values = choose(training, held_out, n_u, params)
+        structure = choose(training, held_out, n_u, params)
         whole = Record([*training.pieces, *held_out.pieces], training.first)
         parameters = whole.fit(structure)
         spread = spread_of(whole, structure, parameters)
         equations.append(Equation(structure, parameters, spread))
-        candidates.append(values)
         told |= effects(whole, structure, parameters)
         blocks = np.concatenate([np.arange(len(y) - whole.first) // BLOCK + 1000 * k for k, (y, _) in enumerate(whole.pieces)])
         _, place = np.unique(blocks, return_inverse=True)
         drawn: list[Equation] = []
         for _ in range(4 * members):
             weights = rng.exponential(size=place.max() + 1)[place]
-            found = Equation(structure, whole.fit(structure, parameters, weights, RESTARTS), spread)
-            if found.growth < 1 and len(drawn) < members:
-                drawn.append(found)
+            if len(drawn) < members:
+                found = Equation(structure, whole.fit(structure, parameters, weights, RESTARTS), spread)
+                drawn += [found] if found.growth < 1 else []
         if len(drawn) < members:
             raise InputError(f"the record does not tell whether {name} is stable, so nothing can be learned on a model of it")
         ensembles.append(drawn)
@@ -494,16 +458,14 @@ def identify(
     untold = [name for name, seen in zip(names[1], told, strict=True) if not seen]
     warnings += [f"the data do not tell an effect of {name} on any output from none" for name in untold]
     members_of = tuple(zip(*ensembles, strict=True))
-    return Identified(tuple(equations), assemble([equations], scales), members_of, scales, tuple(candidates), tuple(warnings))
+    return Identified(tuple(equations), assemble([equations], scales), members_of, scales, tuple(warnings))
 
 
 def effects(record: Record, structure: Structure, parameters: Array) -> NDArray[np.bool_]:
     """Which inputs have an effect on the output that is no chance, (n_u,): some coefficient beyond `TOLD` standard errors."""
-    errors, slopes = record.linearised(structure, parameters)
-    deviation = np.sqrt(np.var(errors) * np.diag(np.linalg.pinv(slopes.T @ slopes)))
-    ratio = np.abs(parameters) / deviation
+    ratio = np.abs(parameters) / np.sqrt(np.diag(record.covariance(structure, parameters)))
     n, n_u = structure.order, len(structure.dead_times)
-    return (ratio[structure.n_own :][: n * n_u].reshape(n_u, n) > TOLD).any(1)
+    return np.asarray((ratio[structure.n_own :][: n * n_u].reshape(n_u, n) > TOLD).any(1))
 
 
 @dataclass(frozen=True)
@@ -536,14 +498,12 @@ def validate_model(
     errors = [record.errors(equation.structure, equation.parameters) for record, equation in fitted]
     begin, warm = records[0].first, 2 * records[0].first
     measured, states, inputs = [], [], []
-    kept = [piece for piece in pieces if len(piece) > warm]
-    for k, piece in enumerate(kept):
-        innovations = np.column_stack([errors[i][k] * y_scale[i] for i in range(len(y_scale))])
+    for piece, *scaled in zip([piece for piece in pieces if len(piece) > warm], *errors, strict=True):
+        innovations = np.column_stack(scaled) * y_scale
         for start in range(warm, len(piece) - horizon + 1, horizon):
-            past = [piece.y[start - 1 - lag] for lag in range(model.lags)]
-            entered = [piece.u[start - 2 - lag] for lag in range(model.taps - 1)]
-            noise = [innovations[start - 1 - lag - begin] for lag in range(model.lags)]
-            states.append(np.concatenate([*past, *entered, *noise]))
+            past, entered = piece.y[start - model.lags : start], piece.u[start - model.taps : start - 1]
+            noise = innovations[start - begin - model.lags : start - begin]
+            states.append(np.concatenate([part[::-1].ravel() for part in (past, entered, noise)]))
             inputs.append(piece.u[start - 1 : start - 1 + horizon])
             measured.append(piece.y[start : start + horizon])
     if not states:

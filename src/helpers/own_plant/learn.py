@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
@@ -27,7 +26,7 @@ from helpers.own_plant.settings import OwnPlantParams, load_own_plant
 from helpers.plant.process import Process
 from helpers.plant.rollout import stream
 from helpers.plant.task import ControlTask
-from helpers.plant.tracking import Scenarios, Tracked, Tracker, track
+from helpers.plant.tracking import Scenarios, Tracked, Tracker
 from helpers.runs.progress import ProgressBar
 from helpers.runs.study import Demonstrations, Study
 from helpers.settings.leaf import InputError
@@ -64,16 +63,12 @@ class OwnPlant:
     @property
     def controlled(self) -> tuple[str, ...]:
         """Names of the controlled variables."""
-        return tuple(variable.name for variable in self.description.controlled)
+        return self.description.names("controlled")
 
     @property
     def manipulated(self) -> tuple[str, ...]:
         """Names of the manipulated variables."""
-        return tuple(variable.name for variable in self.description.manipulated)
-
-    def task(self, initial_mean: Tensor, initial_std: Tensor) -> ControlTask:
-        """The control task, for a process whose first state is distributed so."""
-        return self.description.task(initial_mean, initial_std, self.dtype)
+        return self.description.names("manipulated")
 
     def epochs(self, full: int) -> int:
         """How many of the full number of epochs this scale runs."""
@@ -88,14 +83,10 @@ class OwnPlant:
         base, own = self.base, self.params.learning
         unit = tuple((own.error_unit * task.error_scale.abs()).tolist())
         names = {"controlled": self.controlled, "manipulated": self.manipulated, "sampling_time": self.description.sampling_time}
-        params = replace(
-            base,
-            process=base.process.model_copy(update=names),
-            features=base.features.model_copy(update={"features_on": "y"}),
-            learning=base.learning.model_copy(update={"policy": base.learning.policy.model_copy(update={"error_unit": unit})}),
-            case=base.case.model_copy(update={"offline": base.case.offline.model_copy(update={"epochs": own.offline_epochs})}),
-        )
-        return Study(params=params, scale_params=self.scale, seed=self.seed, case="own plant", own=(process, task))
+        policy = base.learning.policy.model_copy(update={"error_unit": unit})
+        params = replace(base, learning=base.learning.model_copy(update={"policy": policy}))
+        study = Study(params=params, scale_params=self.scale, seed=self.seed, case="own plant", own=(process, task))
+        return study.varied(process=names, features={"features_on": "y"}, offline={"epochs": own.offline_epochs})
 
 
 def open_plant(path: Path, params_root: Path, scale: str, seed: int, params: Params | None = None) -> OwnPlant:
@@ -120,12 +111,9 @@ def identify_plant(plant: OwnPlant) -> tuple[Identified, Validation]:
     """
     description, params = plant.description, plant.params.identification
     first, last = hold_out(stretches(plant.clean, description, 2), params.held_out)
-    scales = (
-        np.array([abs(variable.scale) for variable in description.controlled]),
-        np.array([(variable.high - variable.low) / 2 for variable in description.manipulated]),
-    )
+    half = (description.values("manipulated", "high") - description.values("manipulated", "low")) / 2
+    scales, names = (abs(description.values("controlled", "scale")), half), (plant.controlled, plant.manipulated)
     training, held_out = (thin_out(part, params.longest, PIECE * description.horizon) for part in (first, last))
-    names = (plant.controlled, plant.manipulated)
     identified = identify((training, held_out), scales, names, params, max(4, plant.epochs(params.members)), plant.seed)
     return identified, validate_model(identified, held_out, description.horizon, plant.controlled, params)
 
@@ -138,7 +126,7 @@ def task_on(plant: OwnPlant, model: ArmaxModel) -> ControlTask:
     zero = torch.zeros_like(std).repeat(model.lags)
     means = [y.mean(0).repeat(model.lags), before.mean(0).repeat(model.taps - 1), zero]
     stds = [std.repeat(model.lags), before.std(0).repeat(model.taps - 1), zero]
-    return plant.task(torch.cat(means), torch.cat(stds))
+    return plant.description.task(torch.cat(means), torch.cat(stds), plant.dtype)
 
 
 def learn_offline(plant: OwnPlant, process: Process, task: ControlTask) -> tuple[Study, Apprenticeship]:
@@ -180,12 +168,6 @@ class Workshop:
         drawn = models.members(torch.randint(len(models), (n_models,), generator=generator).repeat_interleave(each))
         return draw_scenarios(drawn, self.operation, self.plant.params.operation, longer * self.n_steps, generator, quiet)
 
-    def reference(self, scenarios: Scenarios) -> tuple[Tensor, Tensor]:
-        """Mean |e| and movement of the record's PID in each episode, (K,) each."""
-        with torch.no_grad():
-            run = track(TrackingPID(self.record, self.operation.bounds), scenarios, self.operation.bounds)
-        return self.operation.error(run), self.operation.movement(run)
-
 
 def open_workshop(plant: OwnPlant, identified: Identified) -> Workshop:
     """Draw the models, find the record's PID and the range of operation; models on which that PID runs away are left out.
@@ -215,28 +197,26 @@ def open_workshop(plant: OwnPlant, identified: Identified) -> Workshop:
 
 def plausible(workshop: Workshop, models: ArmaxModel) -> ArmaxModel:
     """The models that the record's PID can hold, since the record shows that it holds the plant; all, if it can hold few."""
-    generator = workshop.plant.stream("plausible")
-    quiet = draw_scenarios(models, workshop.operation, workshop.plant.params.operation, 3 * workshop.n_steps, generator, quiet=True)
-    with torch.no_grad():
-        run = track(TrackingPID(workshop.record, workshop.operation.bounds), quiet, workshop.operation.bounds)
-    late = (run.error[-workshop.n_steps :].abs() / workshop.operation.unit)[..., list(workshop.operation.loops)].amax((0, 2))
-    held = late < HELD
+    plant, operation = workshop.plant, workshop.operation
+    quiet = draw_scenarios(models, operation, plant.params.operation, 3 * workshop.n_steps, plant.stream("plausible"), quiet=True)
+    late = operation.run(workshop.record, quiet).error[-workshop.n_steps :]
+    held = (late.abs() / operation.unit)[..., list(operation.loops)].amax((0, 2)) < HELD
     return models.members(held) if held.double().mean() > FEWEST else models
 
 
 def tune(workshop: Workshop) -> tuple[Gains, PredictiveControl]:
     """The rivals: the record's PID re-tuned, and predictive control, each at its best on the models of training."""
-    plant, params = workshop.plant, workshop.plant.params.rivals
+    plant, operation, params = workshop.plant, workshop.operation, workshop.plant.params.rivals
     scenarios = workshop.draw(workshop.training, params.episodes, plant.stream("rivals"))
-    reference = workshop.reference(scenarios)
+    reference, moved = operation.figures(workshop.record, scenarios)
 
     def price(error: Tensor, movement: Tensor) -> Tensor:
-        beyond = (movement.mean(-1) / reference[1].mean() / plant.params.policy.movement - SLACK).clamp(min=0)
-        return (error / reference[0]).mean(-1) + BEYOND * beyond
+        beyond = (movement.mean(-1) / moved.mean() / plant.params.policy.movement - SLACK).clamp(min=0)
+        return (error / reference).mean(-1) + BEYOND * beyond
 
     generations = params.model_copy(update={"generations": plant.epochs(params.generations)})
-    gains = tuned_pid(workshop.nominal, scenarios, workshop.record, workshop.operation, price, generations, plant.seed)
-    return gains, tuned_predictive(workshop.nominal, scenarios, workshop.operation, price, params)
+    gains = tuned_pid(workshop.nominal, scenarios, workshop.record, operation, price, generations, plant.seed)
+    return gains, tuned_predictive(workshop.nominal, scenarios, operation, price, params)
 
 
 def learn_policy(
@@ -245,17 +225,16 @@ def learn_policy(
     """One policy for the whole range, by the gradient through the models; it begins as the PID or the policy `start`."""
     plant, operation = workshop.plant, workshop.operation
     params, generator = plant.params.policy, plant.stream(purpose)
-    torch.manual_seed(
-        int(torch.randint(2**31, (1,), generator=generator))
-    )  # torch.nn draws the first weights from the global stream
-    policy = (
-        TrackingPolicy(plant.base.learning.policy, start, operation.unit, operation.centre, operation.unit, operation.bounds)
-        if isinstance(start, Gains)
-        else copy.deepcopy(start)
-    )
+    # torch.nn draws the first weights from the global stream.
+    torch.manual_seed(int(torch.randint(2**31, (1,), generator=generator)))
+    if isinstance(start, Gains):
+        shown = operation.unit, operation.centre, operation.unit
+        policy = TrackingPolicy(plant.base.learning.policy, start, *shown, operation.bounds)
+    else:
+        policy = copy.deepcopy(start)
 
     def measure(scenarios: Scenarios, run: Tracked) -> tuple[Tensor, Tensor]:
-        error, movement = workshop.reference(scenarios)
+        error, movement = operation.figures(workshop.record, scenarios)
         share = operation.error(run) / error
         return share + HARM * (share - 1).clamp(min=0), operation.movement(run) / movement / params.movement
 
@@ -291,9 +270,9 @@ def parameter_table(plant: OwnPlant, identified: Identified) -> pd.DataFrame:
     for name, equation in zip(plant.controlled, identified.equations, strict=True):
         structure = equation.structure
         kind = "rate" if structure.integrating else "gain"
-        free = 1 - equation.parameters[: structure.n_own].sum()
+        effects = equation.inputs.sum(1) / (1 - equation.free.sum())
         row: dict[str, Any] = {"order": structure.order, "integrating": structure.integrating}
-        for j, entry in enumerate(plant.manipulated):
-            row |= {f"dead time of {entry}": structure.dead_times[j], f"{kind} of {entry}": equation.inputs[j].sum() / free}
+        for entry, dead, effect in zip(plant.manipulated, structure.dead_times, effects, strict=True):
+            row |= {f"dead time of {entry}": dead, f"{kind} of {entry}": effect}
         rows[name] = row | {"noise": equation.spread[0], "noise, share of y": equation.spread[1]}
     return pd.DataFrame(rows).T

@@ -17,6 +17,7 @@ from helpers.plant.process import Process
 from helpers.settings.leaf import InputError
 
 GYMNASIUM = "gymnasium:"
+PARAMETERS = ("window", "entry", "constant", "spread")  # of the models side by side
 
 
 @dataclass
@@ -49,11 +50,11 @@ class ArmaxModel:
 
     def members(self, index: Tensor | slice) -> "ArmaxModel":
         """Some of the models, a model an entry of the index."""
-        return replace(self, **{name: getattr(self, name)[index] for name in ("window", "entry", "constant", "spread")})
+        return replace(self, **{name: getattr(self, name)[index] for name in PARAMETERS})
 
     def to(self, dtype: torch.dtype) -> "ArmaxModel":
         """The same in another number type."""
-        return replace(self, **{name: getattr(self, name).to(dtype) for name in ("window", "entry", "constant", "spread")})
+        return replace(self, **{name: getattr(self, name).to(dtype) for name in PARAMETERS})
 
     def step(self, x: Tensor, u: Tensor, noise: Tensor) -> Tensor:
         """The next state, shape (K, n_x), of one model or of one an episode; of the noise the first n_y columns count."""
@@ -110,11 +111,8 @@ class GymnasiumPlant:
         self.n_states = self.n_outputs = self.n_disturbances = len(self.steady_y)
         self.n_inputs = len(self.steady_u)
         self._stepped = False
-        spaces = {
-            "observation": (self.copies[0].observation_space, self.n_outputs),
-            "action": (self.copies[0].action_space, self.n_inputs),
-        }
-        for name, (space, expected) in spaces.items():
+        for name, expected in (("observation", self.n_outputs), ("action", self.n_inputs)):
+            space = getattr(self.copies[0], f"{name}_space")
             if getattr(space, "shape", None) != (expected,):
                 raise InputError(f"{GYMNASIUM}{environment}: expected {name}s of shape ({expected},), found {space}")
 

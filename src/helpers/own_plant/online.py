@@ -1,24 +1,24 @@
 """A few episodes of the plant itself: explore gently, identify again, improve through the new models, take over only if better."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import torch
 from scipy.stats import ttest_rel
 from torch import Tensor
 
-from helpers.learning.tracking_policy import TrackingPID, TrackingPolicy
+from helpers.learning.tracking_policy import TrackingPolicy
 from helpers.own_plant.episodes import Stretch
 from helpers.own_plant.identify import Identified, identify
 from helpers.own_plant.learn import Workshop, learn_policy, open_workshop
 from helpers.plant.process import Process
-from helpers.plant.tracking import Scenarios, Tracker, track
+from helpers.plant.tracking import Scenarios, Tracker
 
 CAREFUL = 0.9  # share of the allowed movement that the policy is given to learn with
 FIGURES = ("mean |e|", "movement", "offset")
+PLACES = (0.0, 0.5, 1.0)  # of the set points of a loop within its range; every combination of those of all loops is judged
 
 
 @dataclass(frozen=True)
@@ -48,28 +48,16 @@ class Improvement:
     """What the episodes of the plant brought.
 
     Attributes:
-        policy: the one to go on with. taken: whether it is the new one. episodes: of the plant, all told.
-        worse: share of the exploring episodes with a greater mean |e| than the record's PID on the same draws.
-        before, after: mean |e| of the old and the new policy on fresh episodes, as shares of the record's PID's. p_value: of the
-            one-sided paired test that the new one is better.
+        policy: the one to go on with. taken: whether it is the new one.
+        before, after: mean |e| of the old and the new policy on fresh episodes, as shares of the record's PID's.
+        words: all of it in a sentence.
     """
 
     policy: TrackingPolicy
     taken: bool
-    episodes: int
-    worse: float
     before: float
     after: float
-    p_value: float
-
-    @property
-    def words(self) -> str:
-        """In a sentence."""
-        return (
-            f"{self.episodes} episodes of the plant: {100 * self.worse:.0f} % of the exploring ones worse than the record's PID; "
-            f"the policy learned after them {'takes over' if self.taken else 'does not take over'} ({100 * self.after:.0f} against "
-            f"{100 * self.before:.0f} % of the record's PID's mean |e| in a paired test, p = {self.p_value:.2g})"
-        )
+    words: str
 
 
 def from_rest(process: Process, set_point: Tensor, load: Tensor, generator: torch.Generator) -> Scenarios:
@@ -92,10 +80,9 @@ def improve_on_plant(workshop: Workshop, identified: Identified, policy: Trackin
     plant, operation, params = workshop.plant, workshop.operation, workshop.plant.params.online
     generator = plant.stream("plant episodes")
     explored = plant_episodes(workshop, process, params.explore, generator)
-    with torch.no_grad():
-        run = track(Exploring(policy, params.disturbance * operation.bounds.span, generator), explored, operation.bounds)
-        recorded = track(TrackingPID(workshop.record, operation.bounds), explored, operation.bounds)
-    worse = (operation.error(run) > operation.error(recorded)).double().mean().item()
+    run = operation.run(Exploring(policy, params.disturbance * operation.bounds.span, generator), explored)
+    recorded, _ = operation.figures(workshop.record, explored)
+    worse = (operation.error(run) > recorded).double().mean().item()
     pieces = [Stretch(y.double().numpy(), u.double().numpy()) for y, u in zip(run.y[:-1].unbind(1), run.u.unbind(1), strict=True)]
     parts = pieces[: len(pieces) * 3 // 4], pieces[len(pieces) * 3 // 4 :]
     names, settings = (plant.controlled, plant.manipulated), plant.params.identification
@@ -108,39 +95,32 @@ def improve_on_plant(workshop: Workshop, identified: Identified, policy: Trackin
     informed = replace(plant, params=plant.params.model_copy(update={"margins": narrow, "policy": careful}))
     new, _ = learn_policy(replace(open_workshop(informed, again), record=workshop.record, operation=operation), policy, "online")
     fresh = plant_episodes(workshop, process, params.test, generator)
-    with torch.no_grad():
-        runs = [
-            track(tracker, fresh, operation.bounds) for tracker in (TrackingPID(workshop.record, operation.bounds), policy, new)
-        ]
-    reference, old, after = (operation.error(each).double() for each in runs)
-    moved = [operation.movement(each).double().mean().item() for each in runs]
-    p_value = float(ttest_rel(np.asarray(after / reference), np.asarray(old / reference), alternative="less").pvalue)
-    taken = p_value < params.level and moved[2] <= plant.params.policy.movement * moved[0]
-    before, since = ((each / reference).mean().item() for each in (old, after))
-    return Improvement(new if taken else policy, taken, params.explore + 2 * params.test, worse, before, since, p_value)
+    errors, moved = zip(*(operation.figures(each, fresh) for each in (workshop.record, policy, new)), strict=True)
+    reference, before, after = (error.double() for error in errors)
+    before, after = before / reference, after / reference
+    p_value = float(ttest_rel(after.numpy(), before.numpy(), alternative="less").pvalue)
+    allowed = plant.params.policy.movement * moved[0].double().mean().item()
+    taken = p_value < params.level and moved[2].double().mean().item() <= allowed
+    old, since = before.mean().item(), after.mean().item()
+    words = (
+        f"{params.explore + 2 * params.test} episodes of the plant: {100 * worse:.0f} % of the exploring ones worse than the "
+        f"record's PID; the policy learned after them {'takes over' if taken else 'does not take over'} ({100 * since:.0f} against "
+        f"{100 * old:.0f} % of the record's PID's mean |e| in a paired test, p = {p_value:.2g})"
+    )
+    return Improvement(new if taken else policy, taken, old, since, words)
 
 
-def at_set_points(
-    workshop: Workshop,
-    process: Process,
-    candidates: Mapping[str, Tracker],
-    n_repeats: int,
-    factors: Sequence[float] = (0.0, 0.5, 1.0),
-) -> pd.DataFrame:
+def at_set_points(workshop: Workshop, process: Process, candidates: Mapping[str, Tracker], n_repeats: int) -> pd.DataFrame:
     """Steps from rest to set points all over the range on whatever stands for the plant, a row a set point and controller.
-
-    Args:
-        factors: of the way from the lowest to the highest set point of each loop; every combination is one set point.
 
     Returns:
         Columns: the set point of each loop (engineering units), controller, mean |e| (in units of half the range), movement (as a
         share of the input ranges, summed over an episode), and offset: the mean error over the last fifth, as a share of the range,
         of the worst loop.
     """
-    operation, dtype = workshop.operation, workshop.operation.unit.dtype
-    places = torch.cartesian_prod(*[torch.tensor(factors, dtype=dtype)] * len(operation.loops)).reshape(-1, len(operation.loops))
+    operation, dtype, loops = workshop.operation, workshop.operation.unit.dtype, list(workshop.operation.loops)
+    places = torch.cartesian_prod(*[torch.tensor(PLACES, dtype=dtype)] * len(loops)).reshape(-1, len(loops))
     set_points = torch.zeros(len(places), len(operation.low), dtype=dtype)
-    loops = list(operation.loops)
     set_points[:, loops] = operation.low[loops] + places * (operation.high - operation.low)[loops]
     n_steps = workshop.n_steps
     aimed = set_points.repeat_interleave(n_repeats, 0).expand(n_steps, -1, -1)
@@ -148,17 +128,10 @@ def at_set_points(
     scenarios = from_rest(process, aimed, no_load, workshop.plant.stream("set points"))
     steady, rows = workshop.plant.description.steady("controlled", dtype), []
     for name, tracker in candidates.items():
-        with torch.no_grad():
-            run = track(tracker, scenarios, operation.bounds)
+        run = operation.run(tracker, scenarios)
         error, moved = (part.reshape(-1, n_repeats).mean(1) for part in (operation.error(run), n_steps * operation.movement(run)))
-        late = (
-            (run.error[-n_steps // 5 :] / operation.reach)[..., loops]
-            .mean(0)
-            .reshape(-1, n_repeats, len(loops))
-            .mean(1)
-            .abs()
-            .amax(-1)
-        )
+        late = (run.error[-n_steps // 5 :] / operation.reach)[..., loops].mean(0)
+        late = late.reshape(-1, n_repeats, len(loops)).mean(1).abs().amax(-1)
         for point, *values in zip(set_points + steady, error, moved, late, strict=True):
             aims = {workshop.plant.controlled[index]: point[index].item() for index in loops}
             rows.append({**aims, "controller": name, **dict(zip(FIGURES, (float(value) for value in values), strict=True))})

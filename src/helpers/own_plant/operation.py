@@ -6,12 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from helpers.learning.tracking_policy import Gains
+from helpers.learning.tracking_policy import Gains, TrackingPID
 from helpers.own_plant.description import PlantDescription
 from helpers.own_plant.model import ArmaxModel
 from helpers.own_plant.quality import CleanRecords
 from helpers.own_plant.settings import OperationParams
-from helpers.plant.tracking import Bounds, Scenarios, Tracked
+from helpers.plant.tracking import Bounds, Scenarios, Tracked, Tracker, track
 from helpers.settings.leaf import InputError
 
 SHRUNK = (1.0, 0.8, 0.6, 0.4, 0.2)  # shares of a drawn set point change, of which the first is taken that the inputs can hold
@@ -45,6 +45,17 @@ class Operation:
         """Middle of the set points, (n_y,)."""
         return (self.low + self.high) / 2
 
+    def run(self, controller: Tracker | Gains, scenarios: Scenarios) -> Tracked:
+        """A controller, or the PID with these gains, through all scenarios; without gradients."""
+        with torch.no_grad():
+            tracker = TrackingPID(controller, self.bounds) if isinstance(controller, Gains) else controller
+            return track(tracker, scenarios, self.bounds)
+
+    def figures(self, controller: Tracker | Gains, scenarios: Scenarios) -> tuple[Tensor, Tensor]:
+        """Mean |e| and movement of each of its episodes, (K,) each."""
+        run = self.run(controller, scenarios)
+        return self.error(run), self.movement(run)
+
     def error(self, run: Tracked) -> Tensor:
         """Mean over samples and loops of |e| of each episode in units of `unit`, (K,)."""
         return (run.error.abs() / self.unit)[..., list(self.loops)].mean((0, 2))
@@ -56,28 +67,21 @@ class Operation:
 
 def operation(clean: CleanRecords, description: PlantDescription, loops: tuple[int, ...], dtype: torch.dtype) -> Operation:
     """The range that the record covers: its set points under automatic control, and those that the description names."""
-    low, high = [], []
+    ends = []
     for index, variable in enumerate(description.controlled):
         named = [variable.set_point, description.transfer.get(variable.name, variable.set_point)]
         if variable.set_point_tag is not None:
             rows = clean.table["automatic"] & (clean.table["segment"] >= 0)
-            recorded = clean.table.loc[rows, variable.set_point_tag]
-            named += [float(recorded.min()), float(recorded.max())] if len(recorded) else []
-        values = np.array(named if index in loops else [variable.steady_state]) - variable.steady_state
-        low.append(values.min())
-        high.append(values.max())
-    reach = (np.array(high) - np.array(low)) / 2
-    scale = np.array([abs(variable.scale) for variable in description.controlled])
+            named += clean.table.loc[rows, variable.set_point_tag].agg(["min", "max"]).dropna().tolist()
+        ends.append((min(named), max(named)) if index in loops else (variable.steady_state,) * 2)
+    least, greatest = np.array(ends).T - description.values("controlled", "steady_state")
+    reach = (greatest - least) / 2
+    scale = np.where(reach > TINY, reach, abs(description.values("controlled", "scale")))
     steady = description.steady("manipulated")
-    rate = [np.inf if variable.rate is None else variable.rate for variable in description.manipulated]
-    bounds = [torch.tensor([getattr(variable, key) for variable in description.manipulated]) - steady for key in ("low", "high")]
-    return Operation(
-        loops,
-        torch.tensor(np.array(low), dtype=dtype),
-        torch.tensor(np.array(high), dtype=dtype),
-        torch.tensor(np.where(reach > TINY, reach, scale), dtype=dtype),
-        Bounds(bounds[0].to(dtype), bounds[1].to(dtype), torch.tensor(rate, dtype=dtype)),
-    )
+    bounds = [torch.tensor(description.values("manipulated", key), dtype=torch.float32) - steady for key in ("low", "high")]
+    rate = torch.tensor(description.values("manipulated", "fastest"))
+    low, high, unit = (torch.tensor(part, dtype=dtype) for part in (least, greatest, scale))
+    return Operation(loops, low, high, unit, Bounds(*(part.to(dtype) for part in (*bounds, rate))))
 
 
 def targets(
@@ -144,14 +148,9 @@ def described_gains(description: PlantDescription, dtype: torch.dtype) -> Gains 
     """The PID of the description per sample, or None where it names none."""
     if not description.pid:
         return None
-    outputs = [variable.name for variable in description.controlled]
-    inputs = [variable.name for variable in description.manipulated]
-    parts = torch.zeros(3, len(inputs), len(outputs), dtype=dtype)
-    for loop in description.pid:
-        place = inputs.index(loop.manipulated), outputs.index(loop.controlled)
-        values = (loop.proportional, loop.integral * description.sampling_time, loop.derivative / description.sampling_time)
-        for part, value in zip(parts, values, strict=True):
-            part[place] = value
+    parts, dt = torch.zeros(3, len(description.manipulated), len(description.controlled), dtype=dtype), description.sampling_time
+    for output, index, loop in description.loops:
+        parts[:, index, output] = torch.tensor([loop.proportional, loop.integral * dt, loop.derivative / dt], dtype=dtype)
     return Gains(*parts)
 
 
@@ -162,10 +161,10 @@ def recorded_gains(clean: CleanRecords, description: PlantDescription, dtype: to
     output after the other, over samples in automatic whose input is not at a bound.
     """
     table = clean.table
-    whole = table["segment"].to_numpy()
-    usable = table["automatic"].to_numpy() & (whole >= 0)
+    whole, automatic = table["segment"].to_numpy(), table["automatic"].to_numpy()
+    usable = automatic & (whole >= 0)
     for back in (1, 2):
-        usable[back:] &= (whole[back:] == whole[:-back]) & table["automatic"].to_numpy()[:-back]
+        usable[back:] &= (whole[back:] == whole[:-back]) & automatic[:-back]
         usable[:back] = False
     parts = np.zeros((3, len(description.manipulated), len(description.controlled)))
     explained = []
@@ -175,7 +174,7 @@ def recorded_gains(clean: CleanRecords, description: PlantDescription, dtype: to
         free = usable & (u > manipulated.low + reach) & (u < manipulated.high - reach)
         free[1:] &= free[:-1]
         move = np.diff(u, prepend=u[:1])[free]
-        best: tuple[float, int, np.ndarray] | None = None
+        found = []
         for i, controlled in enumerate(description.controlled):
             if controlled.set_point_tag is None or len(move) < 10:
                 continue
@@ -183,10 +182,9 @@ def recorded_gains(clean: CleanRecords, description: PlantDescription, dtype: to
             change = np.diff(e, prepend=e[:1])
             past = np.column_stack([change, e, np.diff(change, prepend=change[:1])])[free]
             gains = np.linalg.lstsq(past, move, rcond=None)[0]
-            share = 1 - ((move - past @ gains) ** 2).sum() / max(float((move**2).sum()), TINY)
-            if best is None or share > best[0]:
-                best = (share, i, gains)
-        if best is not None:
-            parts[:, j, best[1]] = best[2]
-            explained.append(best[0])
+            found.append((1 - ((move - past @ gains) ** 2).sum() / max(float((move**2).sum()), TINY), i, gains))
+        if found:
+            share, i, gains = max(found, key=lambda fit: fit[0])
+            parts[:, j, i] = gains
+            explained.append(share)
     return Gains(*torch.tensor(parts, dtype=dtype)), min(explained, default=0.0)

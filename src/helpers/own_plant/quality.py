@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
+from scipy.ndimage import find_objects, label, median_filter
 
-from helpers.own_plant.description import PlantDescription
+from helpers.own_plant.description import PlantDescription, Variable
 from helpers.own_plant.records import Finding, PlantDataError, Records, finding, name_rows
 from helpers.own_plant.settings import QualityParams
 
@@ -62,180 +62,207 @@ def examine(records: Records, description: PlantDescription, params: QualityPara
     Raises:
         PlantDataError: where no rule can help: another sampling time, another unit, an input that hardly moves.
     """
-    found = list(records.findings)
-    columns = _regular(records, description, params, found)
-    row, breaks = columns["row"], np.diff(columns["run"], prepend=columns["run"][:1]) != 0
-    valid = np.ones(len(row), dtype=bool)
+    record = _Examined(records, description, params)
+    columns, breaks = record.columns, record.breaks
+    valid = np.ones(len(breaks), dtype=bool)
     pulses = _pulses([columns[tag] for tag in (*(v.tag for v in description.manipulated), *description.set_point_tags)])
     for controlled in description.controlled:
-        values = columns[controlled.tag]
-        _outside(records, controlled.tag, values, (controlled.low, controlled.high), controlled.unit, row, params, found)
-        _frozen(controlled.tag, values, row, params, found)
-        _spikes(controlled.tag, values, breaks, pulses, row, params, found)
-        valid &= _fill(controlled.tag, values, breaks, row, params, found, straight=True)
+        record.outside(controlled, 0.0)
+        record.frozen(controlled.tag)
+        record.spikes(controlled.tag, pulses)
+        valid &= record.fill(controlled.tag, straight=True)
     for manipulated in description.manipulated:
-        values, span = columns[manipulated.tag], manipulated.high - manipulated.low
-        slack = AT_BOUND * span
-        limits = (manipulated.low - slack, manipulated.high + slack)
-        _outside(records, manipulated.tag, values, limits, manipulated.unit, row, params, found)
-        valid &= _fill(manipulated.tag, values, breaks, row, params, found, straight=False)
+        values, slack = columns[manipulated.tag], AT_BOUND * (manipulated.high - manipulated.low)
+        record.outside(manipulated, slack)
+        valid &= record.fill(manipulated.tag, straight=False)
         np.clip(values, manipulated.low, manipulated.high, out=values)
         at_bound = (values <= manipulated.low + slack) | (values >= manipulated.high - slack)
-        found += finding("input at a bound", manipulated.tag, _rows(row, at_bound), "kept: a controller may saturate")
+        record.note("input at a bound", manipulated.tag, at_bound, "kept: a controller may saturate")
     for tag in description.set_point_tags:
-        valid &= _fill(tag, columns[tag], breaks, row, params, found, straight=False)
+        valid &= record.fill(tag, straight=False)
         steps = np.flatnonzero((np.abs(np.diff(columns[tag])) > 0) & ~breaks[1:]) + 1
-        found += finding("set point step", tag, row[steps], "kept: an episode may begin here")
+        record.note("set point step", tag, steps, "kept: an episode may begin here")
     if description.mode:
-        found += finding(
-            "not in automatic", description.mode, _rows(row, ~columns["automatic"]), "kept for the model, not for episodes"
-        )
-    _excitation(records, description, columns, valid, params)
-    found += finding("of no use", "all", _rows(row, ~valid), "left out: a stretch ends here")
+        record.note("not in automatic", description.mode, ~columns["automatic"], "kept for the model, not for episodes")
+    record.excitation(valid)
+    record.note("of no use", "all", ~valid, "left out: a stretch ends here")
     starts = valid & (~np.roll(valid, 1) | breaks)
     starts[0] = valid[0]
     columns["segment"] = np.where(valid, starts.cumsum() - 1, -1).astype(np.int32)
-    return CleanRecords(pd.DataFrame(columns, copy=False), tuple(found))
+    return CleanRecords(pd.DataFrame(columns, copy=False), tuple(record.found))
 
 
-def _rows(row: NDArray[np.int32], mask: Mask) -> NDArray[np.int32]:
-    """The rows of the file behind some samples, without those that were put in."""
-    rows = row[mask]
-    return rows[rows > 0]
+class _Examined:
+    """A record while it is repaired.
 
-
-def _regular(records: Records, description: PlantDescription, params: QualityParams, found: list[Finding]) -> dict[str, NDArray]:
-    """The columns in equal steps of time: short gaps become missing samples, long ones a new run."""
-    table, path, time = records.table, records.path, description.time
-    row, clock = table["row"].to_numpy(), table["clock"].to_numpy()
-    step = np.diff(clock)
-    if not (step > 0).any():
-        raise PlantDataError(f"{path}: column '{time}': the time of all rows is the same")
-    typical = float(np.median(step[step > 0]))
-    if abs(typical - 1) > 0.02:
-        unit, dt = description.time_unit, description.sampling_time
-        raise PlantDataError(
-            f"{path}: column '{time}': rows are {typical * dt:g} {unit} apart, but 'sampling_time' is {dt:g} {unit}: "
-            f"the one or the other, or 'time_unit', is wrong"
-        )
-    samples = np.rint(step)
-    keep = np.append(samples > 0, True)  # of rows with the same time the last one counts
-    if keep.mean() < MOST:
-        raise PlantDataError(
-            f"{path}: column '{time}': {100 * (1 - keep.mean()):.0f} % of the rows have the time of another one, the first is "
-            f"{name_rows(row[~keep][:1])}; export the record with a finer time"
-        )
-    found += finding("doubled row", time, row[~keep], "the last one kept")
-    row, clock = row[keep], clock[keep]
-    step = np.diff(clock)
-    samples = np.rint(step).astype(np.int64)
-    off = np.abs(step - samples) > params.jitter
-    if off.mean() > params.outside:
-        raise PlantDataError(
-            f"{path}: column '{time}': {100 * off.mean():.0f} % of the rows lie between two samples, the first is "
-            f"{name_rows(row[1:][off][:1])}; export the record at its sampling time"
-        )
-    uneven = (np.abs(step - samples) > 0.01 * np.maximum(samples, 1)) & (samples == 1)
-    found += finding("uneven time", time, row[1:][uneven], "moved to the nearest sample")
-    gap = samples > 1
-    long = samples > params.longest_repair + 1
-    found += finding("short gap", time, row[1:][gap & ~long], f"at most {params.longest_repair} samples put in")
-    found += finding("long gap", time, row[1:][long], "a stretch ends here")
-    place = np.concatenate([[0], np.where(long, 1, samples).cumsum()])
-    length = int(place[-1]) + 1
-    columns: dict[str, NDArray] = {}
-    for name in table:
-        values = table[name].to_numpy()[keep]
-        if name == "clock":
-            continue
-        if name in ("run", "automatic"):
-            columns[name] = values[np.searchsorted(place, np.arange(length), side="right") - 1]
-        else:
-            columns[name] = np.full(length, 0 if name == "row" else np.nan, dtype=values.dtype)
-            columns[name][place] = values
-    late = np.zeros(length, dtype=np.int32)
-    late[place[1:][long]] = 1
-    columns["run"] = columns["run"] + late.cumsum(dtype=np.int32)
-    return columns
-
-
-def _outside(
-    records: Records, tag: str, values: Array, limits: tuple[float, float], unit: str, row: NDArray, params: QualityParams,
-    found: list[Finding],
-) -> None:  # fmt: skip
-    """Values outside their range become missing; where many are, the unit is wrong."""
-    low, high = limits
-    outside = (values < low) | (values > high)
-    share = outside.sum() / max(1, np.isfinite(values).sum())
-    if share > params.outside:
-        typical = float(np.nanmedian(values))
-        guess = next((words for words, convert in CONVERSIONS.items() if low <= convert(typical) <= high), None)
-        hint = f"; it looks like {guess}" if guess and not low <= typical <= high else ""
-        raise PlantDataError(
-            f"{records.path}: column '{tag}': {100 * share:.0f} % of the values lie outside {low:g} to {high:g} {unit} "
-            f"({name_rows(_rows(row, outside))}), their median is {typical:g}{hint}"
-        )
-    found += finding("outside its range", tag, _rows(row, outside), "missing")
-    values[outside] = np.nan
-
-
-def _frozen(tag: str, values: Array, row: NDArray, params: QualityParams, found: list[Finding]) -> None:
-    """A sensor that repeats the very same value for long is frozen: all but the first become missing.
-
-    Long is what chance would hardly bring about, given how often two values are the same elsewhere. A signal that stays the same as
-    often as not is coarse, and one that hardly moved before is at rest: there a repetition says nothing.
+    Attributes:
+        found: what was found so far. columns: in equal steps of time, by name; repaired in place. breaks: where a run begins.
     """
-    move = np.abs(np.diff(values, prepend=np.nan))
-    same, known = move == 0, np.isfinite(move)
-    elsewhere = known & ~_long_runs(same, params.frozen - 1)
-    share = float(np.clip(same[elsewhere].mean(), TINY, COARSE)) if elsewhere.any() else TINY
-    least = max(params.frozen, 1 + int(np.ceil(np.log(BY_CHANCE / len(values)) / np.log(share))))
-    frozen = _long_runs(same, least - 1)
-    at_rest = AT_REST * float(np.median(move[move > 0])) if (move > 0).any() else 0.0
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], frozen, [False]]).astype(np.int8)))
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
-        near = slice(max(0, first - BEFORE), first)
-        before = move[near][known[near]]
-        if share == COARSE or (len(before) and np.median(before) < at_rest):
-            frozen[first:last] = False
-        else:
-            known[first:last] = False  # says nothing about what follows
-    equal = _long_runs(same, least - 1) & ~frozen
-    found += finding("equal values", tag, _rows(row, equal), "kept: the signal is coarse or at rest")
-    found += finding("frozen sensor", tag, _rows(row, frozen), f"{least} or more equal values: all but the first missing")
-    values[frozen] = np.nan
 
+    def __init__(self, records: Records, description: PlantDescription, params: QualityParams) -> None:
+        self.description, self.params, self.path = description, params, records.path
+        self.found = list(records.findings)
+        self.columns = self._regular(records.table)
+        self.breaks = np.diff(self.columns["run"], prepend=self.columns["run"][:1]) != 0
 
-def _spikes(
-    tag: str, values: Array, breaks: Mask, pulses: Array, row: NDArray, params: QualityParams, found: list[Finding]
-) -> None:  # fmt: skip
-    """A value that departs and returns at once is a spike.
+    def note(self, check: str, column: str, where: NDArray, rule: str) -> None:
+        """A finding about some samples, those left aside that were put in."""
+        rows = self.columns["row"][where]
+        self.found += finding(check, column, rows[rows > 0], rule)
 
-    It sticks out of both neighbours by a multiple of the largest other move nearby and of a usual one: a step, a ramp, a peak,
-    an oscillation and the toggling of the last digit move as much before or after. What a pulse of an input may have caused is
-    none: a pulse over the whole range of the input moves the output over its whole range, spikes apart.
-    """
-    known = np.flatnonzero(np.isfinite(values))
-    if len(known) < max(SPIKE) + 2:
-        return
-    series, group = values[known], breaks.cumsum()[known]
-    move = np.abs(np.diff(series))
-    moves = move[move > 0]
-    usual = np.median(moves) if len(moves) else np.inf  # of a coarse signal one step of its resolution
-    largest = sliding_window_view(np.pad(move, NEARBY), NEARBY).max(1)  # [i]: of the moves from sample i - NEARBY to sample i
-    caused = CAUSED * np.ptp(median_filter(series, size=2 * max(SPIKE) + 1, mode="nearest")) * pulses[known]
-    spike = np.zeros(len(known), dtype=bool)
-    for width in SPIKE:
-        sticks_out = _sticks_out(series, width)
-        left = np.arange(len(sticks_out))
-        right = left + width + 1
-        other = np.maximum.reduce([largest[left], largest[right + NEARBY], np.abs(series[right] - series[left])])
-        near = (group[left] == group[right]) & (known[right] - known[left] <= width + 1 + params.longest_repair)
-        far = near & (sticks_out > params.outlier * np.maximum(other, usual)) & (sticks_out > caused[left + 1])
-        for inside in range(1, width + 1):
-            spike[left[far] + inside] = True
-    found += finding("outlier", tag, row[known[spike]], "missing")
-    values[known[spike]] = np.nan
+    def _regular(self, table: pd.DataFrame) -> dict[str, NDArray]:
+        """The columns in equal steps of time: short gaps become missing samples, long ones a new run."""
+        time, params = self.description.time, self.params
+        where = f"{self.path}: column '{time}'"
+        row, clock = table["row"].to_numpy(), table["clock"].to_numpy()
+        step = np.diff(clock)
+        if not (step > 0).any():
+            raise PlantDataError(f"{where}: the time of all rows is the same")
+        typical = float(np.median(step[step > 0]))
+        if abs(typical - 1) > 0.02:
+            unit, dt = self.description.time_unit, self.description.sampling_time
+            raise PlantDataError(
+                f"{where}: rows are {typical * dt:g} {unit} apart, but 'sampling_time' is {dt:g} {unit}: "
+                f"the one or the other, or 'time_unit', is wrong"
+            )
+        keep = np.append(np.rint(step) > 0, True)  # of rows with the same time the last one counts
+        if keep.mean() < MOST:
+            raise PlantDataError(
+                f"{where}: {100 * (1 - keep.mean()):.0f} % of the rows have the time of another one, the first is "
+                f"{name_rows(row[~keep][:1])}; export the record with a finer time"
+            )
+        self.found += finding("doubled row", time, row[~keep], "the last one kept")
+        later, step = row[keep][1:], np.diff(clock[keep])
+        samples = np.rint(step).astype(np.int64)
+        off = np.abs(step - samples) > params.jitter
+        if off.mean() > params.outside:
+            raise PlantDataError(
+                f"{where}: {100 * off.mean():.0f} % of the rows lie between two samples, the first is "
+                f"{name_rows(later[off][:1])}; export the record at its sampling time"
+            )
+        uneven = (np.abs(step - samples) > 0.01 * np.maximum(samples, 1)) & (samples == 1)
+        long = samples > params.longest_repair + 1
+        self.found += finding("uneven time", time, later[uneven], "moved to the nearest sample")
+        self.found += finding("short gap", time, later[(samples > 1) & ~long], f"at most {params.longest_repair} samples put in")
+        self.found += finding("long gap", time, later[long], "a stretch ends here")
+        place = np.concatenate([[0], np.where(long, 1, samples).cumsum()])
+        known, every = table[keep].drop(columns="clock").set_axis(place), np.arange(place[-1] + 1)
+        regular = known.reindex(every)
+        regular["row"] = known["row"].reindex(every, fill_value=0)
+        held = known[["run", "automatic"]].reindex(every, method="ffill")
+        regular["run"] = held["run"] + np.isin(every, place[1:][long]).cumsum(dtype=np.int32)
+        regular["automatic"] = held["automatic"]
+        return {name: values.to_numpy(copy=True) for name, values in regular.items()}
+
+    def outside(self, variable: Variable, slack: float) -> None:
+        """Values outside their range become missing; where many are, the unit is wrong."""
+        tag, low, high = variable.tag, variable.low - slack, variable.high + slack
+        values = self.columns[tag]
+        outside = (values < low) | (values > high)
+        share = outside.sum() / max(1, np.isfinite(values).sum())
+        if share > self.params.outside:
+            typical = float(np.nanmedian(values))
+            guess = next((words for words, convert in CONVERSIONS.items() if low <= convert(typical) <= high), None)
+            hint = f"; it looks like {guess}" if guess and not low <= typical <= high else ""
+            rows = self.columns["row"][outside]
+            raise PlantDataError(
+                f"{self.path}: column '{tag}': {100 * share:.0f} % of the values lie outside {low:g} to {high:g} {variable.unit} "
+                f"({name_rows(rows[rows > 0])}), their median is {typical:g}{hint}"
+            )
+        self.note("outside its range", tag, outside, "missing")
+        values[outside] = np.nan
+
+    def frozen(self, tag: str) -> None:
+        """A sensor that repeats the very same value for long is frozen: all but the first become missing.
+
+        Long is what chance would hardly bring about, given how often two values are the same elsewhere. A signal that stays the
+        same as often as not is coarse, and one that hardly moved before is at rest: there a repetition says nothing.
+        """
+        values = self.columns[tag]
+        move = np.abs(np.diff(values, prepend=np.nan))
+        same, known = move == 0, np.isfinite(move)
+        elsewhere = known & ~_long_runs(same, self.params.frozen - 1)
+        share = float(np.clip(same[elsewhere].mean(), TINY, COARSE)) if elsewhere.any() else TINY
+        least = max(self.params.frozen, 1 + int(np.ceil(np.log(BY_CHANCE / len(values)) / np.log(share))))
+        equal = _long_runs(same, least - 1)
+        at_rest = AT_REST * float(np.median(move[move > 0])) if (move > 0).any() else 0.0
+        frozen = equal.copy()
+        for (run,) in find_objects(label(equal)[0]):
+            near = slice(max(0, run.start - BEFORE), run.start)
+            before = move[near][known[near]]
+            if share == COARSE or (len(before) and np.median(before) < at_rest):
+                frozen[run] = False
+            else:
+                known[run] = False  # says nothing about what follows
+        self.note("equal values", tag, equal & ~frozen, "kept: the signal is coarse or at rest")
+        self.note("frozen sensor", tag, frozen, f"{least} or more equal values: all but the first missing")
+        values[frozen] = np.nan
+
+    def spikes(self, tag: str, pulses: Array) -> None:
+        """A value that departs and returns at once is a spike.
+
+        It sticks out of both neighbours by a multiple of the largest other move nearby and of a usual one: a step, a ramp, a peak,
+        an oscillation and the toggling of the last digit move as much before or after. What a pulse of an input may have caused is
+        none: a pulse over the whole range of the input moves the output over its whole range, spikes apart.
+        """
+        values, params = self.columns[tag], self.params
+        known = np.flatnonzero(np.isfinite(values))
+        if len(known) < max(SPIKE) + 2:
+            return
+        series, group = values[known], self.breaks.cumsum()[known]
+        move = np.abs(np.diff(series))
+        moves = move[move > 0]
+        usual = np.median(moves) if len(moves) else np.inf  # of a coarse signal one step of its resolution
+        largest = sliding_window_view(np.pad(move, NEARBY), NEARBY).max(1)  # [i]: of the moves from sample i - NEARBY to sample i
+        caused = CAUSED * np.ptp(median_filter(series, size=2 * max(SPIKE) + 1, mode="nearest")) * pulses[known]
+        spike = np.zeros(len(known), dtype=bool)
+        for width in SPIKE:
+            sticks_out = _sticks_out(series, width)
+            left = np.arange(len(sticks_out))
+            right = left + width + 1
+            other = np.maximum.reduce([largest[left], largest[right + NEARBY], np.abs(series[right] - series[left])])
+            near = (group[left] == group[right]) & (known[right] - known[left] <= width + 1 + params.longest_repair)
+            far = near & (sticks_out > params.outlier * np.maximum(other, usual)) & (sticks_out > caused[left + 1])
+            for inside in range(1, width + 1):
+                spike[left[far] + inside] = True
+        self.note("outlier", tag, known[spike], "missing")
+        values[known[spike]] = np.nan
+
+    def fill(self, tag: str, straight: bool) -> Mask:
+        """Fill short stretches of missing values, measured ones on a straight line, others by the last value; True where one is."""
+        values, group = self.columns[tag], self.breaks.cumsum()
+        missing = np.isnan(values)
+        known = np.flatnonzero(~missing)
+        places = np.flatnonzero(missing & ~_long_runs(missing, self.params.longest_repair + 1))
+        places = places[(places > known.min(initial=len(values))) & (places < known.max(initial=0))]
+        after = np.searchsorted(known, places)
+        before, after = known[after - 1], known[after]
+        same = group[before] == group[after if straight else places]
+        places, before, after = places[same], before[same], after[same]
+        share = (places - before) / (after - before) if straight else np.zeros(len(places))
+        values[places] = values[before] + share * (values[after] - values[before])
+        self.note("filled", tag, before, f"{'on a straight line' if straight else 'by the last value'}, from the row before")
+        return ~np.isnan(values)
+
+    def excitation(self, valid: Mask) -> None:
+        """Every input must move, and no two of them as one."""
+        if not valid.any():
+            raise PlantDataError(f"{self.path}: no row is complete")
+        tags = [variable.tag for variable in self.description.manipulated]
+        inputs = np.column_stack([self.columns[tag][valid] for tag in tags])
+        spans = self.description.values("manipulated", "high") - self.description.values("manipulated", "low")
+        for tag, share in zip(tags, inputs.std(0) / spans, strict=True):
+            if share < self.params.least_movement:
+                raise PlantDataError(
+                    f"{self.path}: column '{tag}': too little excitation, its standard deviation is {100 * share:.2g} % of its "
+                    f"range, so its effect cannot be identified"
+                )
+        pairs = np.triu(np.abs(np.atleast_2d(np.corrcoef(inputs, rowvar=False))), 1)
+        if pairs.max() > self.params.collinear:
+            one, other = (tags[index] for index in np.unravel_index(np.argmax(pairs), pairs.shape))
+            raise PlantDataError(
+                f"{self.path}: columns '{one}' and '{other}': the inputs move as one, so their effects cannot be told apart"
+            )
 
 
 def _pulses(inputs: list[Array]) -> Array:
@@ -260,61 +287,7 @@ def _sticks_out(values: Array, width: int) -> Array:
     return np.maximum(inside.min(1) - np.maximum(left, right), np.minimum(left, right) - inside.max(1))
 
 
-def _fill(tag: str, values: Array, breaks: Mask, row: NDArray, params: QualityParams, found: list[Finding], straight: bool) -> Mask:
-    """Fill short stretches of missing values, measured ones on a straight line, others by the last value; True where one is."""
-    missing = np.isnan(values)
-    if not missing.any():
-        return np.ones(len(values), dtype=bool)
-    short = missing & ~_long_runs(missing, params.longest_repair + 1)
-    known = np.flatnonzero(~missing)
-    inner = short & (np.arange(len(values)) > known[0]) & (np.arange(len(values)) < known[-1])
-    places = np.flatnonzero(inner)
-    before = known[np.searchsorted(known, places) - 1]
-    after = known[np.searchsorted(known, places)]
-    group = breaks.cumsum()
-    same = group[before] == group[after] if straight else group[before] == group[places]
-    places, before, after = places[same], before[same], after[same]
-    share = (places - before) / (after - before) if straight else np.zeros(len(places))
-    values[places] = values[before] + share * (values[after] - values[before])
-    rule = "on a straight line" if straight else "by the last value"
-    found += (
-        [Finding("filled", tag, len(places), tuple(int(r) for r in row[before[:5]]), f"{rule}, from the row before")]
-        if len(places)
-        else []
-    )
-    return ~np.isnan(values)
-
-
 def _long_runs(mask: Mask, least: int) -> Mask:
     """Where a mask is true for at least `least` samples in a row."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    first, last = edges[::2], edges[1::2]
-    long = last - first >= least
-    change = np.zeros(len(mask) + 1, dtype=np.int32)
-    change[first[long]] += 1
-    change[last[long]] -= 1
-    return change.cumsum()[:-1].astype(bool)
-
-
-def _excitation(
-    records: Records, description: PlantDescription, columns: dict[str, NDArray], valid: Mask, params: QualityParams
-) -> None:
-    """Every input must move, and no two of them as one."""
-    if not valid.any():
-        raise PlantDataError(f"{records.path}: no row is complete")
-    inputs = np.column_stack([columns[variable.tag][valid] for variable in description.manipulated])
-    spans = np.array([variable.high - variable.low for variable in description.manipulated])
-    spread = inputs.std(0) / spans
-    for variable, share in zip(description.manipulated, spread, strict=True):
-        if share < params.least_movement:
-            raise PlantDataError(
-                f"{records.path}: column '{variable.tag}': too little excitation, its standard deviation is {100 * share:.2g} % "
-                f"of its range, so its effect cannot be identified"
-            )
-    correlation = np.abs(np.corrcoef(inputs, rowvar=False)) if inputs.shape[1] > 1 else np.zeros((1, 1))
-    first, second = np.unravel_index(np.argmax(np.triu(correlation, 1)), correlation.shape)
-    if correlation.ndim and np.triu(correlation, 1).max() > params.collinear:
-        one, other = (description.manipulated[index].tag for index in (int(first), int(second)))
-        raise PlantDataError(
-            f"{records.path}: columns '{one}' and '{other}': the inputs move as one, so their effects cannot be told apart"
-        )
+    runs, _ = label(mask)
+    return mask & (np.bincount(runs)[runs] >= least)

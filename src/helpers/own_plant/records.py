@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pandera.pandas as pa
 import pyarrow as arrow
 from pyarrow import compute, csv, parquet
 
@@ -77,9 +76,9 @@ def read_records(path: Path, description: PlantDescription) -> Records:
     raw = _read(path, description)
     if not len(raw):
         raise PlantDataError(f"{path}: the file holds no rows")
-    rows = np.arange(FIRST_ROW, FIRST_ROW + len(raw))
+    rows = np.arange(FIRST_ROW, FIRST_ROW + len(raw), dtype=np.int32)
     found: list[Finding] = []
-    columns: dict[str, np.ndarray] = {"row": rows.astype(np.int32), "clock": _clock(raw.pop(description.time), path, description)}
+    columns: dict[str, np.ndarray] = {"row": rows, "clock": _clock(raw.pop(description.time), path, description)}
     columns["run"] = pd.factorize(raw.pop(description.episode))[0] if description.episode else np.zeros(len(raw), dtype=np.int32)
     known = raw.pop(description.mode).astype(str).isin(description.automatic) if description.mode else None
     columns["automatic"] = np.ones(len(raw), dtype=bool) if known is None else known.to_numpy(dtype=bool)
@@ -93,14 +92,14 @@ def read_records(path: Path, description: PlantDescription) -> Records:
         numbers = np.where(bad, np.nan, numbers) if bad.any() else numbers
         found += finding("no number", tag, rows[bad], "missing")
         columns[tag] = numbers
-    order = np.argsort(columns["clock"], kind="stable")
     late = np.flatnonzero(np.diff(columns["clock"]) < 0) + 1
     found += finding("out of order", description.time, rows[late], "sorted by time")
-    if len(late):
-        columns = {name: values[order] for name, values in columns.items()}
-    columns["run"] = _changes(columns["run"])  # in the order of time: one late row must not cut its run into pieces
     table = pd.DataFrame(columns, copy=False)
-    return Records(path, _schema(description).validate(table), tuple(found))
+    if len(late):
+        table = table.sort_values("clock", kind="stable", ignore_index=True)
+    # Up by one wherever the episode changes, in the order of time: one late row must not cut its run into pieces.
+    table["run"] = table["run"].diff().fillna(0).ne(0).cumsum().astype(np.int32)
+    return Records(path, table, tuple(found))
 
 
 def _read(path: Path, description: PlantDescription) -> pd.DataFrame:
@@ -128,11 +127,9 @@ def _read_text(path: Path, description: PlantDescription, columns: list[str]) ->
     with path.open(encoding=encoding, newline="") as file:
         head = file.read(HEAD).removeprefix("\ufeff").splitlines() or [""]
     head = head[: max(1, len(head) - 1)]  # the last line may be cut
-    separator = {None: None, "tab": "\t"}.get(description.separator, description.separator) or max(
-        SEPARATORS, key=lambda mark: len({*columns} & {*_cells(head[:1], mark)[0]})
-    )
-    tags = [column for column in columns if column not in (description.time, description.episode, description.mode)]
-    decimal = description.decimal or _decimal(_cells(head, separator), tags)
+    separator: str | None = "\t" if description.separator == "tab" else description.separator
+    separator = separator or max(SEPARATORS, key=lambda mark: len({*columns} & {*_cells(head[:1], mark)[0]}))
+    decimal = description.decimal or _decimal(_cells(head, separator), description.tags)
     reading = csv.ReadOptions(encoding=encoding)
     parsing = csv.ParseOptions(delimiter=separator)
     with csv.open_csv(path, reading, parsing) as file:
@@ -141,7 +138,7 @@ def _read_text(path: Path, description: PlantDescription, columns: list[str]) ->
     options = csv.ConvertOptions(include_columns=columns, decimal_point=decimal, column_types=as_text)
     found = csv.read_csv(path, reading, parsing, options)
     if decimal == ",":  # a word among the numbers leaves them text
-        for tag in tags:
+        for tag in description.tags:
             if arrow.types.is_string(found[tag].type):
                 place = found.column_names.index(tag)
                 found = found.set_column(place, tag, compute.replace_substring(found[tag], ",", "."))
@@ -159,14 +156,12 @@ def _encoding(path: Path) -> str:
     with path.open("rb") as file:
         if file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
             return "utf-16"
-        file.seek(0)
-        decoder = codecs.getincrementaldecoder("utf-8")()
-        try:
-            while block := file.read(1 << 20):
-                decoder.decode(block)
-            decoder.decode(b"", final=True)
-        except UnicodeDecodeError:
-            return "latin-1"
+    try:
+        with path.open(encoding="utf-8") as words:
+            while words.read(1 << 20):
+                pass
+    except UnicodeDecodeError:
+        return "latin-1"
     return "utf-8"
 
 
@@ -174,14 +169,12 @@ def _cells(lines: list[str], separator: str) -> list[list[str]]:
     return list(text.reader(lines, delimiter=separator)) or [[]]
 
 
-def _decimal(rows: list[list[str]], tags: list[str]) -> str:
+def _decimal(rows: list[list[str]], tags: tuple[str, ...]) -> str:
     """What stands before the decimals of most of the numbers."""
     places = [place for place, name in enumerate(rows[0]) if name in tags]
     cells = [row[place].strip() for row in rows[1:] for place in places if place < len(row)]
-    commas, points = (
-        sum(bool(re.fullmatch(rf"[+-]?\d*{mark}\d+([eE][+-]?\d+)?", cell)) for cell in cells) for mark in (",", r"\.")
-    )
-    return "," if commas > points else "."
+    marks = [found[1] for cell in cells if (found := re.fullmatch(r"[+-]?\d*([,.])\d+([eE][+-]?\d+)?", cell))]
+    return "," if marks.count(",") > marks.count(".") else "."
 
 
 def _clock(time: pd.Series, path: Path, description: PlantDescription) -> np.ndarray:
@@ -199,25 +192,3 @@ def _clock(time: pd.Series, path: Path, description: PlantDescription) -> np.nda
         how = f"of the 'time_format' {description.time_format}" if description.time_format else "(keys 'time_format', 'decimal')"
         raise PlantDataError(f"{where}: no time in {name_rows(bad)} {how}")
     return (numbers - numbers.min()) / description.sampling_time
-
-
-def _changes(codes: np.ndarray) -> np.ndarray:
-    """A number that goes up by one wherever the code of the episode changes."""
-    return np.concatenate([[0], (np.diff(codes) != 0).cumsum()]).astype(np.int32)
-
-
-def _schema(description: PlantDescription) -> pa.DataFrameSchema:
-    """What the table must be, whatever the file was."""
-    tags = set(description.columns) - {description.time, description.episode, description.mode}
-    numbers = {tag: pa.Column(float, nullable=True) for tag in sorted(tags)}
-    clock = pa.Column(float, pa.Check(lambda clock: clock.is_monotonic_increasing))
-    return pa.DataFrameSchema(
-        {
-            "row": pa.Column("int32", unique=True),
-            "clock": clock,
-            "run": pa.Column("int32"),
-            "automatic": pa.Column(bool),
-            **numbers,
-        },
-        strict=True,
-    )

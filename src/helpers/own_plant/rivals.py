@@ -1,17 +1,19 @@
 """What a practitioner would take: the PID of the record, the same re-tuned on all models, and offset-free predictive control."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
 
 import cma
 import numpy as np
 import torch
 from torch import Tensor
 
-from helpers.learning.tracking_policy import Gains, TrackingPID
+from helpers.learning.tracking_policy import Gains
 from helpers.own_plant.model import ArmaxModel
 from helpers.own_plant.operation import Operation
 from helpers.own_plant.settings import RivalParams
-from helpers.plant.tracking import Scenarios, track
+from helpers.plant.tracking import Scenarios
 
 Price = Callable[[Tensor, Tensor], Tensor]  # of each episode's mean |e| and movement, (..., K) each
 
@@ -21,16 +23,15 @@ def side_by_side(scenarios: Scenarios, n_copies: int) -> Scenarios:
     model = scenarios.process
     assert isinstance(model, ArmaxModel)
     index = torch.arange(len(model)).repeat(n_copies)
-    return Scenarios(
-        model.members(index), scenarios.set_point[:, index], scenarios.load[:, index], scenarios.start[index],
-        scenarios.before[index], scenarios.disturbance[:, index], scenarios.noise[:, index],
-    )  # fmt: skip
+    rows = {name: getattr(scenarios, name)[index] for name in ("start", "before")}
+    columns = {name: getattr(scenarios, name)[:, index] for name in ("set_point", "load", "disturbance", "noise")}
+    return Scenarios(model.members(index), **rows, **columns)
 
 
 def step_response(model: ArmaxModel, n_steps: int) -> np.ndarray:
     """The undisturbed outputs after a unit step of each input, from rest at zero, (n_u, n_steps + 1, n_y)."""
-    still = ArmaxModel(model.window, model.entry, torch.zeros_like(model.constant), model.spread * 0, model.lags, model.taps)
-    still = still.members(torch.zeros(model.n_inputs, dtype=torch.long))
+    one = model.members(torch.zeros(model.n_inputs, dtype=torch.long))
+    still = replace(one, constant=one.constant * 0, spread=one.spread * 0)
     x, u = model.window.new_zeros(model.n_inputs, model.n_states), torch.eye(model.n_inputs, dtype=model.window.dtype)
     outputs = [still.observe(x, x)]
     for _ in range(n_steps):
@@ -84,10 +85,8 @@ def tuned_pid(
 
     def costs(start: Tensor, logs: Tensor) -> list[float]:
         spread = Gains(*gains(start, logs).repeat_interleave(n_episodes, dim=0).unbind(1))
-        with torch.no_grad():
-            run = track(TrackingPID(spread, operation.bounds), side_by_side(scenarios, len(logs)), operation.bounds)
-        shape = (len(logs), n_episodes)
-        value = price(operation.error(run).reshape(shape), operation.movement(run).reshape(shape))
+        figures = operation.figures(spread, side_by_side(scenarios, len(logs)))
+        value = price(*(figure.reshape(len(logs), n_episodes) for figure in figures))
         return list(value.nan_to_num(1e9).clamp(max=1e9).tolist())
 
     found: list[tuple[float, Tensor]] = []
@@ -116,39 +115,33 @@ class PredictiveControl:
 
     def __init__(self, model: ArmaxModel, operation: Operation, horizon: int, penalty: float, kappa: float) -> None:
         n_y, n_u, lags, taps = model.n_outputs, model.n_inputs, model.lags, model.taps
-        dtype = model.window.dtype
-        own, inputs, zeros = model.window[0].double().split([n_y * lags, n_u * (taps - 1), n_y * lags], dim=-1)
+        dtype, loops, exact = model.window.dtype, list(operation.loops), model.to(torch.float64)
+        zero = exact.window.new_zeros
+        own, inputs, zeros = exact.window[0].split([n_y * lags, n_u * (taps - 1), n_y * lags], dim=-1)
         one = torch.cat([torch.eye(n_y, dtype=own.dtype), zeros], dim=-1).unflatten(-1, (-1, n_y))
-        drifting = torch.cat([one, torch.zeros(n_y, 1, n_y, dtype=own.dtype)], 1)
+        drifting = torch.cat([one, zero(n_y, 1, n_y)], 1)
         drifting[:, 1:] -= kappa * one
-        padded = torch.cat([own, torch.zeros(n_y, n_y, dtype=own.dtype)], dim=-1)
-        window = torch.cat([padded, inputs, drifting[:, 1:].flatten(1)], dim=-1)
-        self.model = ArmaxModel(
-            window[None], model.entry.double()[:1], torch.zeros(1, n_y).double(), torch.zeros(1, n_y, 2).double(), lags + 1, taps
-        )
-        self.operation, loops = operation, list(operation.loops)
+        window = torch.cat([own, zero(n_y, n_y), inputs, drifting[:, 1:].flatten(1)], dim=-1)
+        self.model = ArmaxModel(window[None], exact.entry[:1], zero(1, n_y), zero(1, n_y, 2), lags + 1, taps)
+        # Side by side: every state at one without a move, and a unit move of every input from rest.
         n_x = self.model.n_states
-        x, still = torch.eye(n_x, dtype=own.dtype), torch.zeros(n_x, n_u, dtype=own.dtype)
-        first = self.model.step(torch.zeros(n_u, n_x).double(), torch.eye(n_u).double(), torch.zeros(n_u, n_x).double())
-        free, forced = [], [self.model.observe(first, first)]
+        x = torch.cat([torch.eye(n_x, dtype=own.dtype), zero(n_u, n_x)])
+        u, outputs = torch.cat([zero(n_x, n_u), torch.eye(n_u, dtype=own.dtype)]), []
         for _ in range(horizon):
-            x = self.model.step(x, still, torch.zeros_like(x))
-            first = self.model.step(first, still[:n_u], torch.zeros_like(first))
-            free.append(self.model.observe(x, x))
-            forced.append(self.model.observe(first, first))
-        ahead = torch.stack(free).cumsum(0)[..., loops]  # (N, n_x, loops): what is to come without a further move
-        step = torch.stack(forced[:-1]).cumsum(0)[..., loops]  # (N, n_u, loops): after a unit move
-        effect = torch.zeros(horizon, len(loops), horizon, n_u, dtype=own.dtype)
+            x, u = self.model.step(x, u, torch.zeros_like(x)), torch.zeros_like(u)
+            outputs.append(self.model.observe(x, x))
+        ahead, step = torch.stack(outputs).cumsum(0)[..., loops].split([n_x, n_u], dim=1)  # (N, n_x or n_u, loops)
+        effect = zero(horizon, len(loops), horizon, n_u)
         for i in range(horizon):
             effect[i:, :, i] = step[: horizon - i].mT
         scale = operation.unit[loops].double()
         weighted = (effect / scale[:, None, None]).reshape(horizon * len(loops), -1)
         moves = penalty * operation.bounds.span.double().repeat(horizon) ** -2
         law = torch.linalg.solve(weighted.T @ weighted + moves.diag(), weighted.T)[:n_u].reshape(n_u, horizon, len(loops)) / scale
-        self.on_error = torch.zeros(n_u, n_y, dtype=own.dtype)
+        self.on_error = zero(n_u, n_y)
         self.on_error[:, loops] = law.sum(1)
-        self.on_state = torch.einsum("uil,ixl->ux", law, ahead).to(dtype)
         self.on_error = self.on_error.to(dtype)
+        self.on_state = torch.einsum("uil,ixl->ux", law, ahead).to(dtype)
         self.model = self.model.to(dtype)
 
     def start(self, n_trajectories: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -174,14 +167,9 @@ def tuned_predictive(
     nominal: ArmaxModel, scenarios: Scenarios, operation: Operation, price: Price, params: RivalParams
 ) -> PredictiveControl:
     """Predictive control whose penalty on moves and observer do best on all models."""
-    best: tuple[float, PredictiveControl] | None = None
-    for kappa in params.observer:
-        for penalty in params.penalties:
-            control = PredictiveControl(nominal.to(operation.unit.dtype), operation, params.horizon, penalty, kappa)
-            with torch.no_grad():
-                run = track(control, scenarios, operation.bounds)
-            value = float(price(operation.error(run)[None], operation.movement(run)[None])[0])
-            if best is None or value < best[0]:
-                best = (value, control)
-    assert best is not None
-    return best[1]
+    model = nominal.to(operation.unit.dtype)
+    controls = [
+        PredictiveControl(model, operation, params.horizon, penalty, kappa)
+        for kappa, penalty in product(params.observer, params.penalties)
+    ]
+    return min(controls, key=lambda control: float(price(*operation.figures(control, scenarios))))

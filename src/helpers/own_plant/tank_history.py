@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 import torch
+from scipy.signal import lfilter
 from torch import Tensor
 
 from helpers.own_plant.tank import HistoryParams, NonlinearTank, load_tank
@@ -23,13 +24,6 @@ FILE = PROJECT / "notebooks/plant/tank.csv"
 LOOPS = ("AC101", "TC101")  # the tags of the loops: .PV what is measured, .SP the set point, .OP the input
 START = pd.Timestamp("2026-01-05")
 AUTOMATIC, MANUAL, BAD = "AUTO", "MAN", "Bad"
-
-
-def pi_controller(params: HistoryParams, task_set_point: Tensor, sampling_time: float) -> PID:
-    """The PI that wrote the file, for a set point in deviation variables."""
-    none = (0.0,) * len(params.proportional)
-    gains = GainParams.model_construct(proportional=params.proportional, integral=params.integral, derivative=none)
-    return PID(gains, task_set_point, sampling_time)
 
 
 @dataclass(frozen=True)
@@ -59,10 +53,8 @@ class Plan:
                 by_hand[first : first + 4 * length] = (params.manual_move * span * moves).repeat_interleave(length, 0)
         keep = 1 - 1 / params.drift_time  # an Ornstein-Uhlenbeck process, sample by sample
         kicks = torch.randn(n_samples, generator=generator, dtype=torch.float64) * (1 - keep**2) ** 0.5
-        drift = torch.zeros(n_samples, dtype=torch.float64)
-        for t in range(1, n_samples):
-            drift[t] = keep * drift[t - 1] + params.drift * kicks[t]
-        return cls(targets, by_hand, drift)
+        kicks[0] = 0
+        return cls(targets, by_hand, torch.tensor(lfilter([params.drift], [1, -keep], kicks)))
 
 
 def record(tank: NonlinearTank, params: HistoryParams, plan: Plan, generator: torch.Generator) -> pd.DataFrame:
@@ -76,7 +68,9 @@ def record(tank: NonlinearTank, params: HistoryParams, plan: Plan, generator: to
     steady_y, steady_u = torch.tensor(tank.steady.controlled), torch.tensor(tank.steady.manipulated)
     x = torch.zeros(1, tank.n_states, dtype=torch.float64)
     low, high = (torch.tensor(bound, dtype=torch.float64) for bound in (params.input_low, params.input_high))
-    pid = pi_controller(params, plan.set_point[0], tank.sampling_time)
+    none = (0.0,) * tank.n_inputs
+    gains = GainParams.model_construct(proportional=params.proportional, integral=params.integral, derivative=none)
+    pid = PID(gains, plan.set_point[0], tank.sampling_time)
     memory = pid.start(1, n_samples, generator)
     u = held = torch.zeros(1, tank.n_inputs, dtype=torch.float64)
     rows: list[Tensor] = []
@@ -116,7 +110,6 @@ def spoil(table: pd.DataFrame, n_faults: int, seed: int) -> pd.DataFrame:
         return [slice(first, first + length - 1) for first in rng.integers(100, len(table) - 100, n_faults)]
 
     measured = [f"{loop}.PV" for loop in LOOPS]
-    numbers = table.select_dtypes("number").columns
     for place in rows(1):
         tag = rng.choice(measured)
         spoilt.loc[place, tag] += 12 * table[tag].std() * rng.choice([-1, 1])
@@ -126,9 +119,8 @@ def spoil(table: pd.DataFrame, n_faults: int, seed: int) -> pd.DataFrame:
     for place in rows(1):
         spoilt.loc[place, "TIME"] += sampling * rng.uniform(0.1, 0.3)
     text = spoilt.astype(object)
-    decimals = {column: 4 if column.startswith(LOOPS[0]) else 3 for column in numbers}
-    for column, places in decimals.items():
-        text[column] = [f"{value:.{places}f}" for value in spoilt[column]]
+    for column in table.select_dtypes("number"):
+        text[column] = spoilt[column].map(("{:.4f}" if column.startswith(LOOPS[0]) else "{:.3f}").format)
     text["TIME"] = spoilt["TIME"].dt.strftime("%Y-%m-%dT%H:%M:%S.%f").str[:-5]
     for place in rows(2):
         text.loc[place, rng.choice(measured)] = BAD

@@ -44,8 +44,9 @@ LABELS = {
 }
 THE_PAPERS = "irl_reinforce"
 RIVALS = ("clone_reinforce", "csil_reinforce", "scratch_reinforce", "ppo", "recurrent_ppo", "pid_tuned", "pid_scheduled")
-LEARNERS = (THE_PAPERS, *RIVALS)  # the rivals need no model
+LEARNERS = (THE_PAPERS, "irl_alone", *RIVALS)  # the rivals need no model
 LEVELS = ("one_policy", "mpc", "minimum_variance", "expert", "dynamic_programme")
+DASHES = (*KIND_STYLES, (0, (6, 1, 1, 1, 1, 1)))
 RUNS = {"hot": "hot start", "cloned": "from the clone", "scratch": "from scratch"}
 NOTHING = "#c8c8c8"  # under a condition in which no controller earns anything
 GRIDS = {  # of each group of conditions: title, label of the rows, label of the columns
@@ -114,13 +115,13 @@ def budget_by_case(curves: pd.DataFrame, levels: Mapping[int, Mapping[str, float
 
 def _draw_budget(axes: Axes, curves: pd.DataFrame, levels: Mapping[str, float]) -> None:
     names = [name for name in LEARNERS if name in set(curves["learner"])]
-    for name, colour, marker in zip(names, cycle(LOOP_COLOURS), cycle("osv^D*PX"), strict=False):
+    for name, colour, marker in zip(names, cycle(LOOP_COLOURS), cycle("osv^D*PXh"), strict=False):
         spent = curves[curves["learner"] == name].groupby("episodes")["objective"]
         low, line, high = (spent.quantile(share) for share in (0.25, 0.5, 0.75))
         axes.plot(line.index, line, label=LABELS[name], markersize=4, color=colour, marker=marker)
         if (high > low).any():
             axes.fill_between(line.index, low, high, color=colour, alpha=0.15, linewidth=0)
-    for name, dash in zip([name for name in LEVELS if name in levels], cycle(KIND_STYLES), strict=False):
+    for name, dash in zip([name for name in LEVELS if name in levels], DASHES, strict=False):
         axes.axhline(levels[name], label=LABELS[name], color=MUTED, linestyle=dash, linewidth=1.2)
     axes.set_xlabel("plant episodes spent")
     axes.set_ylabel("tracking objective $J$ on $x$ (no unit)")

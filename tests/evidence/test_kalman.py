@@ -45,8 +45,8 @@ def test_two_steps_by_hand(study):
         assert seen[0].numpy() == pytest.approx(mean, rel=1e-9)
         for _ in range(m):
             P, mean = A @ P @ A.T + np.diag(d * (mean**2 + P.diagonal())), A @ mean + B @ np.full(2, 5.0)
-    assert memory.mean[0].numpy() == pytest.approx(mean)
-    assert memory.covariance[0].numpy() == pytest.approx(P)
+    assert memory[0][0].numpy() == pytest.approx(mean)
+    assert memory[1][0].numpy() == pytest.approx(P)
 
 
 def test_the_estimate_is_nearer_to_the_state_than_the_reading(study):

@@ -49,7 +49,7 @@ def budgeted(opened):
     small = contest.scale.model_copy(update={"episodes": 200, "every": 50, "judged": 10})
     contest = replace(contest, limits=contest.limits.model_copy(update={"scales": {"smoke": small}}))
     result = equal_budget.reinforced(contest, opened.fresh_policy(), "scratch", True)
-    return result.curve, 0, list(result.build.args[0].state_dict().values())
+    return result.curve, 0, list(result.build.keywords["policy"].state_dict().values())
 
 
 def assert_equal(found, expected):

@@ -6,13 +6,13 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from helpers.evidence.experiments import Prepared, Scores, economical, gap_to, predictive
+from helpers.evidence.experiments import Prepared, Scores, economical, gap_to, scaled
 from helpers.learning.algorithm_2 import initial_weights
 from helpers.learning.cloning import clone
 from helpers.learning.evaluation import feature_gap, objective
 from helpers.learning.features import FeatureMap
 from helpers.learning.policy import LSTMPolicy
-from helpers.plant.controllers import Controller, Operator
+from helpers.plant.controllers import Controller, Operator, SaturatedLQ
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
 from helpers.runs.study import Demonstrations, Study, copied
@@ -46,7 +46,9 @@ def feature_sets(prepared: Prepared) -> Scores:
     truth, scores = prepared.expert_features, Scores()
     everything = tuple(range(len(truth)))
     for name, kept in (("type_one", everything[: len(session.task.set_point)]), ("all_types", everything)):
-        policy = _matching(prepared, short, kept)
+        chosen = SomeFeatures(**vars(short.features), kept=kept)
+        start = initial_weights(short.variant_params.weights, len(short.task.set_point), short.dtype)[list(kept)]
+        policy = short.imitate(prepared.demonstrations, short.fresh_policy(), start, chosen).policy
         fresh, improved = session.fresh(policy), session.improve(copied(policy), "x").policy
         v = session.features.trajectory(fresh).mean(0).double()
         scores[name] = {
@@ -56,13 +58,6 @@ def feature_sets(prepared: Prepared) -> Scores:
             "objective_after_online": session.judge(session.fresh(improved))["objective_x"],
         }
     return scores
-
-
-def _matching(prepared: Prepared, session: Study, kept: tuple[int, ...]) -> LSTMPolicy:
-    """The policy that Algorithm 2 learns when it knows these features only."""
-    chosen = SomeFeatures(**vars(session.features), kept=kept)
-    start = initial_weights(session.variant_params.weights, len(session.task.set_point), session.dtype)[list(kept)]
-    return session.imitate(prepared.demonstrations, session.fresh_policy(), start, chosen).policy
 
 
 def record(session: Study, controller: Controller, purpose: str) -> Demonstrations:
@@ -94,8 +89,10 @@ def _learned_from(prepared: Prepared, data: Demonstrations) -> tuple[LSTMPolicy,
 
 
 def _from_predictive(prepared: Prepared) -> Scores:
-    _, figures = _learned_from(prepared, record(prepared.session, predictive(prepared), "predictive"))
-    return {"from_predictive": figures}
+    session, params = prepared.session, prepared.params.demonstrators
+    process = session.process
+    controller = SaturatedLQ(process.state_step, process.input_step, session.task, params.horizon, params.move_penalty)
+    return {"from_predictive": _learned_from(prepared, record(session, controller, "predictive"))[1]}
 
 
 def _from_operator(prepared: Prepared) -> Scores:
@@ -115,10 +112,8 @@ def _from_operator(prepared: Prepared) -> Scores:
 def _from_rest(prepared: Prepared) -> Scores:
     """Data and simulation both begin at the set point and stay there; the gap is to the controller in the task itself."""
     session, params = prepared.session, prepared.params.demonstrators
-    spread = tuple(params.rest_std * std for std in session.params.case.initial_std)
-    at_rest = session.varied(
-        case={"initial_mean": session.params.case.set_point, "initial_std": spread}, offline={"epochs": params.epochs}
-    )
+    case = {"initial_mean": session.params.case.set_point, "initial_std": scaled(params.rest_std, session.params.case.initial_std)}
+    at_rest = session.varied(case=case, offline={"epochs": params.epochs})
     learned = economical(at_rest).imitate(record(at_rest, at_rest.expert, "at rest"), session.fresh_policy()).policy
     fresh = session.fresh(learned)
     objective_x = session.judge(fresh)["objective_x"]
@@ -153,12 +148,11 @@ def conditions(prepared: Prepared) -> dict[str, Study]:
     pairs = zip(case.initial_mean, params.initial_shift, case.initial_std, strict=True)
     shifted = tuple(mean + shift * std for mean, shift, std in pairs)
     target = tuple(factor * value for factor, value in zip(params.set_point_factor, case.set_point, strict=True))
-    stronger = tuple(params.disturbance_factor * gain for gain in process.disturbance)
     return {
         "nominal": session,
         "initial_state": session.varied(case={"initial_mean": shifted}),
         "set_point": session.varied(case={"set_point": target}),
-        "disturbance": session.varied(process={"disturbance": stronger}),
+        "disturbance": session.varied(process={"disturbance": scaled(params.disturbance_factor, process.disturbance)}),
     }
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from helpers.evidence.alternatives import cloned
-from helpers.evidence.experiments import Prepared
+from helpers.evidence.experiments import Prepared, scaled
 from helpers.evidence.mpc import OffsetFreeMPC
 from helpers.evidence.scheduled_pid import ScheduledPID
 from helpers.learning.algorithm_1 import Reward, algorithm_1
@@ -94,15 +94,22 @@ class Visitor:
         """Whether so many episodes are a new point of the curve."""
         return episodes % self.contest.scale.every == 0 and all(episodes != spent for spent, *_ in self.curve)
 
-    @staticmethod
-    def read(rows: Sequence[Sequence[float]]) -> list[tuple[int, float, float]]:
-        """A curve as it was kept."""
-        return [(int(episodes), mean, error) for episodes, mean, error in rows]
-
     def __call__(self, episodes: int, controller: Controller | LSTMPolicy) -> None:
         """Add a point."""
         returns = self.contest.returns(self.contest.session.fresh(controller, self.contest.scale.judged))
-        self.curve.append((episodes, returns.mean().item(), returns.std().item() / len(returns) ** 0.5))
+        self.curve.append((episodes, *mean_and_error(returns)))
+
+
+def mean_and_error(values: Tensor) -> tuple[float, float]:
+    """The mean of a sample and its standard error."""
+    return values.mean().item(), values.std().item() / len(values) ** 0.5
+
+
+def as_it_is(contest: Contest, build: Build) -> Learned:
+    """A controller that spends no episode of the plant: its curve is one point."""
+    visitor = Visitor(contest)
+    visitor(0, build(contest.session))
+    return Learned(build, visitor.curve)
 
 
 def reinforced(
@@ -141,7 +148,7 @@ def reinforced(
         return {"policy": learner.average.state_dict(), "curve": visitor.curve}
 
     kept = session.trained(train, learner, purpose)
-    return Learned(partial(_deployed, copied(policy, kept["policy"])), visitor.read(kept["curve"]))
+    return Learned(partial(Study.deploy, policy=copied(policy, kept["policy"])), kept["curve"])
 
 
 def coherent_reward(contest: Contest, clone: LSTMPolicy) -> Reward:
@@ -160,10 +167,6 @@ def coherent_reward(contest: Contest, clone: LSTMPolicy) -> Reward:
     return lambda batch: log_density(batch.command, mode(batch), spread) + even
 
 
-def _deployed(policy: LSTMPolicy, session: Study) -> Controller:
-    return session.deploy(policy)
-
-
 def searched(contest: Contest, purpose: str, cells: int, set_point_factors: Sequence[float]) -> Learned:
     """The gains of a PID, or with `cells` the network that schedules them, by CMA-ES on the real objective (Hansen 2016).
 
@@ -174,7 +177,7 @@ def searched(contest: Contest, purpose: str, cells: int, set_point_factors: Sequ
     session, params, visitor = contest.session, contest.limits.tuning, Visitor(contest)
     generator, n_y = session.stream("limits", purpose), len(session.task.set_point)
     target = session.params.case.set_point
-    runs = [session.varied(case={"set_point": tuple(factor * entry for entry in target)}) for factor in set_point_factors]
+    runs = [session.varied(case={"set_point": scaled(factor, target)}) for factor in set_point_factors]
     each = -(-params.episodes // len(runs))
 
     def costs(candidates: np.ndarray) -> np.ndarray:
@@ -256,20 +259,15 @@ def from_library(contest: Contest, name: str) -> Learned:
 
     kept = session.once(train, "library", name)
     model.policy.load_state_dict(kept["policy"])
-    return Learned(build, visitor.read(kept["curve"]))
+    return Learned(build, kept["curve"])
 
 
 def predictive(contest: Contest) -> Learned:
     """Offset-free MPC, which learns nothing: it has the model of the process instead."""
-    params = contest.limits.predictive
-
-    def build(run: Study) -> Controller:
-        nominal = contest.session.process
-        return OffsetFreeMPC(nominal, run.task, params.horizon, params.move_penalty, params.disturbance_std)
-
-    visitor = Visitor(contest)
-    visitor(0, build(contest.session))
-    return Learned(build, visitor.curve)
+    nominal, params = contest.session.process, contest.limits.predictive
+    return as_it_is(
+        contest, lambda run: OffsetFreeMPC(nominal, run.task, params.horizon, params.move_penalty, params.disturbance_std)
+    )
 
 
 def learn_all(contest: Contest) -> dict[str, Learned]:
@@ -287,9 +285,7 @@ def learn_all(contest: Contest) -> dict[str, Learned]:
     }
     if contest.scale.library:
         learned |= {name: from_library(contest, name) for name in ("ppo", "recurrent_ppo")}
-    visitor = Visitor(contest)
-    visitor(0, clone)
-    return {"clone": Learned(partial(_deployed, clone), visitor.curve)} | learned
+    return {"clone": as_it_is(contest, partial(Study.deploy, policy=clone))} | learned
 
 
 def curves(learned: Mapping[str, Learned]) -> pd.DataFrame:

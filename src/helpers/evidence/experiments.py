@@ -19,7 +19,6 @@ from helpers.learning.control_quality import settling_time
 from helpers.learning.evaluation import feature_gap
 from helpers.learning.learner import TrainingError, baseline_regressors, discounted_return, regression_advantage, surrogate
 from helpers.learning.policy import LSTMPolicy, PolicyController
-from helpers.plant.controllers import SaturatedLQ
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
 from helpers.runs.finished import State
@@ -82,6 +81,11 @@ def economical(session: Study) -> Study:
     return replace(session, scale_params=scale.model_copy(update=fewer))
 
 
+def scaled(factor: float, values: Sequence[float]) -> tuple[float, ...]:
+    """Entries of a parameter file times a factor."""
+    return tuple(factor * value for value in values)
+
+
 def gap_to(session: Study, trajectories: Trajectories, expert_features: Tensor) -> float:
     """The feature gap of trajectories to the features of an expert, shape (d,)."""
     return feature_gap(session.features.trajectory(trajectories).mean(0).double(), expert_features)
@@ -114,12 +118,6 @@ def by_loop(session: Study, figures: Mapping[str, Tensor]) -> dict[str, float]:
     """Figures of shape (n_y,) as single numbers, <name>:<controlled variable>."""
     loops = session.params.process.controlled
     return {f"{name}:{loop}": value for name, of in figures.items() for loop, value in zip(loops, of.tolist(), strict=True)}
-
-
-def predictive(prepared: Prepared) -> SaturatedLQ:
-    """The predictive controller of the session's task."""
-    session, params = prepared.session, prepared.params.demonstrators
-    return SaturatedLQ(session.process.state_step, session.process.input_step, session.task, params.horizon, params.move_penalty)
 
 
 def responses(prepared: Prepared) -> Scores:

@@ -17,6 +17,7 @@ from helpers.evidence.identification import Fit, Problem, Profile, fit, polish, 
 from helpers.evidence.readings import GAINS, MAIN, READINGS, TIME, Key, Reading, Values, Vector, simulate
 from helpers.learning.features import feature_names
 from helpers.plant.rollout import stream
+from helpers.runs.finished import State
 from helpers.runs.opening import IdentificationSession
 from helpers.settings.paper import Params
 
@@ -120,20 +121,18 @@ class Fitting:
     def profile(self, problem: Problem, best: Fit, key: Key, rise: float) -> Profile:
         """The profile of one setting about the fit of a problem."""
 
-        def compute() -> dict[str, Vector]:
+        def compute() -> State:
             found = profile(problem, best, key, rise, self.session.scale_params)
-            return {"grid": found.grid, "losses": found.losses}
+            return {"grid": found.grid.tolist(), "losses": found.losses.tolist()}
 
-        return Profile(**self._once(compute, _what(problem), key, rise))
+        kept = self.session.finished.once(compute, _what(problem), key, rise)
+        return Profile(np.array(kept["grid"]), np.array(kept["losses"]))
 
     def _fitted(self, problem: Problem, compute: Callable[[], Fit], *start: Any) -> Fit:
-        found = self._once(lambda: {"z": (fitted := compute()).z, "loss": np.array(fitted.loss)}, _what(problem), *start)
-        return Fit(problem.settings(found["z"]), found["z"], float(found["loss"]))
-
-    def _once(self, compute: Callable[[], Mapping[str, Vector]], *what: Any) -> dict[str, Vector]:
-        """Numbers that an interrupted run has left, or else what is computed now."""
-        state = self.session.finished.once(lambda: {name: values.tolist() for name, values in compute().items()}, *what)
-        return {name: np.array(values) for name, values in state.items()}
+        kept = self.session.finished.once(
+            lambda: {"z": (found := compute()).z.tolist(), "loss": found.loss}, _what(problem), *start
+        )
+        return Fit(problem.settings(z := np.array(kept["z"])), z, kept["loss"])
 
     def best(self, problem: Problem, fits: Sequence[Fit]) -> Fit:
         """The best of several fits, polished on many draws to a finer tolerance."""

@@ -1,6 +1,5 @@
 """Filters in front of a controller: what the observation noise costs, and what a predictive controller corrects its model by."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -10,18 +9,8 @@ from helpers.plant.controllers import Controller
 from helpers.plant.process import LinearProcess
 from helpers.plant.task import ControlTask
 
-
-@dataclass(frozen=True)
-class FilterMemory:
-    """The state as expected before its observation, and the memory of the controller behind the filter.
-
-    Attributes:
-        mean, covariance: of x_t given y_0..y_(t-1), shapes (K, n_x) and (K, n_x, n_x).
-    """
-
-    mean: Tensor
-    covariance: Tensor
-    inner: Any
+# Mean (K, n_x) and covariance (K, n_x, n_x) of x_t given y_0..y_(t-1), and the memory of the controller behind the filter.
+FilterMemory = tuple[Tensor, Tensor, Any]
 
 
 class Filtered:
@@ -42,19 +31,16 @@ class Filtered:
         """The distribution of the initial states."""
         mean = self.task.initial_mean.expand(n_trajectories, -1)
         covariance = (self.task.initial_std**2).diag().expand(n_trajectories, -1, -1)
-        return FilterMemory(mean, covariance, self.controller.start(n_trajectories, n_steps, generator))
+        return mean, covariance, self.controller.start(n_trajectories, n_steps, generator)
 
     def act(self, observation: Tensor, memory: FilterMemory) -> tuple[Tensor, FilterMemory]:
         """Correct by the observation, act on the estimate, and predict the next state."""
-        mean, covariance = self._corrected(observation, memory.mean, memory.covariance)
-        command, inner = self.controller.act(mean, memory.inner)
-        u = command.clamp(self.task.input_low, self.task.input_high)
-        return command, FilterMemory(*self.process.moments(mean, covariance, u), inner)
-
-    def _corrected(self, observation: Tensor, mean: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
+        mean, covariance, inner = memory
         noise = self.observation_variance * (mean**2 + covariance.diagonal(dim1=-2, dim2=-1))  # of the expected square
         tiny = torch.finfo(mean.dtype).tiny  # a state known to be nought is observed without noise
         innovation = covariance + (noise + tiny).diag_embed()
         gain = torch.linalg.solve(innovation, covariance).mT  # both are symmetric
-        corrected = mean + (gain @ (observation - mean)[..., None])[..., 0]
-        return corrected, covariance - gain @ covariance
+        mean, covariance = mean + (gain @ (observation - mean)[..., None])[..., 0], covariance - gain @ covariance
+        command, inner = self.controller.act(mean, inner)
+        u = command.clamp(self.task.input_low, self.task.input_high)
+        return command, (*self.process.moments(mean, covariance, u), inner)

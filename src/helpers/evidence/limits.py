@@ -1,6 +1,7 @@
 """The first verbs of notebook 06: how far every controller is from the attainable, and its control quality."""
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -8,7 +9,7 @@ from torch import Tensor
 
 from helpers.evidence import one_policy
 from helpers.evidence.attainable import Optimum, Resolution, Tabulated, dynamic_programme, grid_around
-from helpers.evidence.equal_budget import Build, Contest, Learned, Visitor
+from helpers.evidence.equal_budget import Build, Contest, Learned, as_it_is, mean_and_error
 from helpers.evidence.experiments import prepare
 from helpers.evidence.kalman import Filtered
 from helpers.learning.control_quality import harris_index, quality
@@ -16,7 +17,6 @@ from helpers.learning.evaluation import objective
 from helpers.plant.controllers import Controller
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
-from helpers.plant.tracking import AtSetPoint
 from helpers.runs.session import Session
 from helpers.runs.study import Study
 from helpers.settings.limits import load_limits
@@ -57,13 +57,12 @@ def attain(contest: Contest, beta: float) -> tuple[Optimum, pd.DataFrame]:
         optimum = dynamic_programme(session.process, session.task, beta, features.params.discount, axes, resolution)
         greedy = session.fresh(Tabulated(optimum), scale.draws)
         returns = objective(greedy, features, beta).double()
-        value, found = optimum.value_at(greedy.x[0]).mean().item(), returns.mean().item()
+        value, (found, error) = optimum.value_at(greedy.x[0]).mean().item(), mean_and_error(returns)
         gap = value / found - 1
         change = found / rows[-1]["monte_carlo"] - 1 if rows else np.nan
         agrees = (
             abs(gap) <= params.tolerance and min(value, found) >= least * (1 - params.tolerance) and abs(change) <= params.tolerance
         )
-        error = returns.std().item() / len(returns) ** 0.5
         row = {"beta": beta, "states": states, "inputs": inputs, "value": value, "monte_carlo": found, "standard_error": error}
         rows.append(row | {"difference": gap, "change": change, "minimum_variance_x": least, "agrees": float(agrees)})
         if agrees:
@@ -109,13 +108,7 @@ def of_the_paper(contest: Contest) -> dict[str, Build]:
 
 def through_the_model(contest: Contest) -> Learned:
     """Notebook 09's policy for every set point, trained by the gradient through the model: it needs no episode of the plant."""
-    policy, visitor = one_policy.stored(contest.session), Visitor(contest)
-
-    def build(run: Study) -> Controller:
-        return AtSetPoint(policy, run.task)
-
-    visitor(0, build(contest.session))
-    return Learned(build, visitor.curve)
+    return as_it_is(contest, partial(Study.deploy, policy=one_policy.stored(contest.session)))
 
 
 def gaps(contest: Contest, optima: Mapping[float, Optimum], learned: Mapping[str, Learned]) -> pd.DataFrame:
@@ -133,18 +126,15 @@ def gaps(contest: Contest, optima: Mapping[float, Optimum], learned: Mapping[str
         returns = {name: objective(batch, features, beta).double() for name, batch in every.items()}
         best = returns["dynamic_programme"]
         for name, values in returns.items():
-            rows.append({"beta": beta, "controller": name, **_interval(values), **_gap(values, best)})
+            mean, reach = values.mean().item(), NORMAL * values.std().item() / len(values) ** 0.5
+            interval = {"objective": mean, "low": mean - reach, "high": mean + reach}
+            rows.append({"beta": beta, "controller": name, **interval, **_gap(values, best)})
     return pd.DataFrame(rows)
 
 
 def _full(contest: Contest, name: str, build: Build) -> Trajectories:
     session = without_noise(contest.session) if name in ON_STATE else contest.session
     return session.fresh(build(session), contest.scale.draws)
-
-
-def _interval(values: Tensor) -> dict[str, float]:
-    mean, reach = values.mean().item(), NORMAL * values.std().item() / len(values) ** 0.5
-    return {"objective": mean, "low": mean - reach, "high": mean + reach}
 
 
 def _gap(values: Tensor, best: Tensor) -> dict[str, float]:

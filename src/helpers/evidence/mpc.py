@@ -1,7 +1,5 @@
 """Linear offset-free model predictive control with a Kalman filter, its quadratic programmes solved by a library."""
 
-from dataclasses import dataclass
-
 import daqp
 import numpy as np
 import torch
@@ -11,13 +9,8 @@ from torch import Tensor
 from helpers.plant.process import LinearProcess
 from helpers.plant.task import ControlTask
 
-
-@dataclass(frozen=True)
-class PredictiveMemory:
-    """State and disturbance as expected before the observation (K, n_x + n_x), and the input applied last (K, n_u)."""
-
-    predicted: Tensor
-    u_previous: Tensor
+# State and disturbance as expected before the observation (K, n_x + n_x), and the input applied last (K, n_u).
+PredictiveMemory = tuple[Tensor, Tensor]
 
 
 class OffsetFreeMPC:
@@ -80,16 +73,15 @@ class OffsetFreeMPC:
         """The mean initial state, no disturbance, and the input at u* = 0."""
         mean = self.task.initial_mean.double()
         expected = torch.cat([mean, torch.zeros_like(mean)]).expand(n_trajectories, -1)
-        return PredictiveMemory(expected, self.task.input_low.double().new_zeros(n_trajectories, len(self.task.input_low)))
+        return expected, self.task.input_low.double().new_zeros(n_trajectories, len(self.task.input_low))
 
     def act(self, observation: Tensor, memory: PredictiveMemory) -> tuple[Tensor, PredictiveMemory]:
         """The first input of the plan made at this sample."""
-        innovation = observation.double() - memory.predicted[:, : observation.shape[-1]]
-        estimate = memory.predicted + innovation @ self.filter_gain.T
-        known = torch.cat([estimate, memory.u_previous, torch.ones_like(estimate[:, :1])], dim=-1).numpy()
-        u = torch.from_numpy(self.plan(known)[:, : memory.u_previous.shape[-1]])
-        predicted = estimate @ self.model.T + u @ self.input_model.T
-        return u.to(observation.dtype), PredictiveMemory(predicted, u)
+        predicted, u_previous = memory
+        estimate = predicted + (observation.double() - predicted[:, : observation.shape[-1]]) @ self.filter_gain.T
+        known = torch.cat([estimate, u_previous, torch.ones_like(estimate[:, :1])], dim=-1).numpy()
+        u = torch.from_numpy(self.plan(known)[:, : u_previous.shape[-1]])
+        return u.to(observation.dtype), (estimate @ self.model.T + u @ self.input_model.T, u)
 
     def plan(self, known: np.ndarray) -> np.ndarray:
         """u_0..u_(N-1) for what is known, rows (x, d, u_previous, 1); shape (K, N n_u)."""

@@ -1,11 +1,13 @@
 """Every controller on plants other than the one of the model, and at set points that it was not trained on."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from itertools import product
 from typing import NamedTuple
 
 import pandas as pd
 
-from helpers.evidence.equal_budget import Build, Contest
+from helpers.evidence.equal_budget import Build, Contest, mean_and_error
+from helpers.evidence.experiments import scaled
 from helpers.evidence.mismatch import Delayed, LoadStep
 from helpers.learning.evaluation import objective
 from helpers.learning.policy import LSTMPolicy
@@ -33,44 +35,35 @@ class Condition(NamedTuple):
     dead_time: int = 0
 
 
-def conditions(contest: Contest) -> list[Condition]:
+def conditions(contest: Contest) -> Iterator[Condition]:
     """Every plant and set point of params/limits.yaml; at a scale of `corners`, the first and last factor of each list alone."""
     session, params = contest.session, contest.limits.robustness
     process, case = session.params.process, session.params.case
     grids = params.model_dump()
     if contest.scale.corners:
         grids = {name: (values[0], values[-1]) for name, values in grids.items() if name.endswith("_factors")}
-    found = []
-    for state in grids["state_factors"]:
-        for entry in grids["input_factors"]:
-            plant = mismatched(session, state, entry)
-            found.append(Condition("model", f"{state:g}", f"{entry:g}", session, plant))
-    for disturbance in grids["disturbance_factors"]:
-        for noise in grids["noise_factors"]:
-            changes = {
-                "disturbance": tuple(disturbance * gain for gain in process.disturbance),
-                "observation_noise": tuple(noise * std for std in process.observation_noise),
+    for state, entry in product(grids["state_factors"], grids["input_factors"]):
+        yield Condition("model", f"{state:g}", f"{entry:g}", session, mismatched(session, state, entry))
+    for disturbance, noise in product(grids["disturbance_factors"], grids["noise_factors"]):
+        plant = session.varied(
+            process={
+                "disturbance": scaled(disturbance, process.disturbance),
+                "observation_noise": scaled(noise, process.observation_noise),
             }
-            plant = session.varied(process=changes)
-            found.append(Condition("noise", f"{disturbance:g}", f"{noise:g}", session, plant))
-    for first in grids["set_point_factors"]:
-        for others in grids["set_point_factors"]:
-            factors = [first, *[others] * (len(case.set_point) - 1)]
-            target = tuple(factor * value for factor, value in zip(factors, case.set_point, strict=True))
-            told = session.varied(case={"set_point": target})
-            found.append(Condition("set_point", f"{first:g}", f"{others:g}", told, told))
-    for dead_time in (0, params.dead_time):
-        for load in (0.0, params.load):
-            found.append(Condition("time", f"{dead_time}", f"{load:g}", session, session, load, dead_time))
-    return found
+        )
+        yield Condition("noise", f"{disturbance:g}", f"{noise:g}", session, plant)
+    for first, others in product(grids["set_point_factors"], repeat=2):
+        told = session.varied(case={"set_point": scaled(first, case.set_point[:1]) + scaled(others, case.set_point[1:])})
+        yield Condition("set_point", f"{first:g}", f"{others:g}", told, told)
+    for dead_time, load in product((0, params.dead_time), (0.0, params.load)):
+        yield Condition("time", f"{dead_time}", f"{load:g}", session, session, load, dead_time)
 
 
 def mismatched(session: Study, state: float, entry: float) -> Study:
     """The session with A and B of Eq. 4.1.3b scaled."""
-    process = session.params.process
-    drift_state = tuple(tuple(state * value for value in row) for row in process.drift_state)
-    drift_input = tuple(tuple(entry * value for value in row) for row in process.drift_input)
-    return session.varied(process={"drift_state": drift_state, "drift_input": drift_input})
+    drift_state, drift_input = session.params.process.drift_state, session.params.process.drift_input
+    scaled_state = tuple(scaled(state, row) for row in drift_state)
+    return session.varied(process={"drift_state": scaled_state, "drift_input": tuple(scaled(entry, row) for row in drift_input)})
 
 
 def robustness(contest: Contest, builds: Mapping[str, Build]) -> pd.DataFrame:
@@ -83,8 +76,7 @@ def robustness(contest: Contest, builds: Mapping[str, Build]) -> pd.DataFrame:
         for name, build in builds.items():
             batch = _under(contest, condition, build(condition.told))
             returns = objective(batch, condition.told.features.on("x"), contest.beta).double()
-            error = returns.std().item() / len(returns) ** 0.5
-            rows.append((condition.group, condition.row, condition.column, name, returns.mean().item(), error))
+            rows.append((condition.group, condition.row, condition.column, name, *mean_and_error(returns)))
     return pd.DataFrame(rows, columns=["group", "row", "column", "controller", "objective", "standard_error"])
 
 

@@ -1,7 +1,5 @@
 """A PID whose gains a network schedules: control-informed reinforcement learning (Bloor et al. 2024, arXiv 2408.13566)."""
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
@@ -9,14 +7,7 @@ from helpers.plant.task import ControlTask
 from helpers.settings.paper import GainParams
 
 WIDEST = 5.0  # ln of the greatest factor that the network puts on a gain
-
-
-class ScheduledMemory(NamedTuple):
-    """The command before, the error before and its change, each (K, n_y)."""
-
-    command: Tensor
-    error: Tensor
-    change: Tensor
+ScheduledMemory = tuple[Tensor, Tensor, Tensor]  # the command before, the error before and its change, each (K, n_y)
 
 
 class ScheduledPID:
@@ -73,8 +64,7 @@ class ScheduledPID:
         """The law at one sample; the first has no derivative, as in the PID of the demonstrations."""
         error = self.set_point - observation
         p, i, d = self.gains(error)
-        if memory is None:
-            memory = ScheduledMemory(p * error, error, torch.zeros_like(error))
-        change = error - memory.error
-        command = memory.command + p * change + i * error * self.dt + d * (change - memory.change) / self.dt
-        return command, ScheduledMemory(command, error, change)
+        before, error_before, change_before = memory or (p * error, error, torch.zeros_like(error))
+        change = error - error_before
+        command = before + p * change + i * error * self.dt + d * (change - change_before) / self.dt
+        return command, (command, error, change)

@@ -20,9 +20,7 @@ from helpers.settings.leaf import (
     Text,
     Vector,
     check_length,
-    check_scales,
-    read_yaml,
-    validate,
+    load_record,
 )
 from helpers.settings.paper import Params
 
@@ -167,22 +165,19 @@ class IdentificationParams(Record):
 def load_experiments(root: Path, params: Params) -> ExperimentParams:
     """The settings of the extra runs, from experiments.yaml, for the process of a case."""
     path = root / "experiments.yaml"
-    record = validate(ExperimentParams, read_yaml(path), path)
+    record = load_record(ExperimentParams, path)
     if record.demonstrators.by_hand not in params.process.manipulated:
         known, found = ", ".join(params.process.manipulated), record.demonstrators.by_hand
         raise ParameterError(f"{path}: key 'demonstrators.by_hand': expected one of {known}, found '{found}'")
-    expected = len(params.process.controlled)
     for name in ("initial_shift", "set_point_factor"):
-        check_length(path, f"conditions.{name}", getattr(record.conditions, name), expected)
+        check_length(path, f"conditions.{name}", getattr(record.conditions, name), len(params.process.controlled))
     return record
 
 
 def load_identification(root: Path, params: Params) -> IdentificationParams:
     """How the inferred settings are found, from identification.yaml, for the process of a case."""
     path = root / "identification.yaml"
-    record = validate(IdentificationParams, read_yaml(path), path)
-    expected = len(params.process.controlled)
+    record = load_record(IdentificationParams, path, params.learning.scales)
     for name in ("input_bound", "proportional", "integral", "derivative"):
-        check_length(path, f"search.{name}", getattr(record.search, name), expected, "loop")
-    check_scales(path, params.learning.scales, record.scales)
+        check_length(path, f"search.{name}", getattr(record.search, name), len(params.process.controlled), "loop")
     return record

@@ -6,13 +6,13 @@ expected.
 """
 
 import copy
-from collections.abc import Container, Iterable, Sized
+from collections.abc import Iterable, Iterator, Sized
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, Strict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, Strict, ValidationError, model_validator
 from pydantic_core import PydanticCustomError, core_schema
 from ruamel.yaml import YAML
 from ruamel.yaml.composer import Composer, ComposerError
@@ -99,17 +99,30 @@ NotZero = Annotated[Real, AfterValidator(_not_zero)]
 Matrix = Annotated[tuple[Vector, ...], Field(min_length=1)]
 
 
+Rules = Iterator[tuple[bool, str]]
+
+
 class Record(BaseModel):
-    """A frozen record that refuses unknown keys."""
+    """A frozen record that refuses unknown keys and what breaks a rule between its entries."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    @model_validator(mode="after")
+    def _follows_its_rules(self) -> Self:
+        for broken, sentence in self._rules():
+            if broken:
+                raise refusal(sentence)
+        return self
 
-def same_length(expected: int, record: BaseModel, *names: str) -> None:
-    """Refuse a record in which one of these fields has not as many entries as expected."""
-    for name in names:
-        if (found := len(getattr(record, name))) != expected:
-            raise refusal(f"'{name}' has {found} entries, expected {expected}")
+    def _rules(self) -> Rules:
+        """The rules between entries: whether each is broken, and the sentence that says so; none is read behind a broken one."""
+        yield from ()
+
+    def _lengths(self, expected: int, *names: str) -> Rules:
+        """The rule that these fields have as many entries as expected."""
+        for name in names:
+            found = len(getattr(self, name))
+            yield found != expected, f"'{name}' has {found} entries, expected {expected}"
 
 
 R = TypeVar("R", bound=Record)
@@ -178,11 +191,17 @@ def list_leaves(content: Any, file: str, key: str = "") -> list[dict[str, Any]]:
     return []
 
 
-def check_scales(path: Path, expected: Iterable[str], found: Container[str]) -> None:
-    """Refuse a file that lacks one of the scales of learning.yaml, but for the lesson, which is not of all notebooks."""
-    for scale in expected:
-        if scale not in found and scale != LESSON:
+def load_record(kind: type[R], path: Path, scales: Iterable[str] = ()) -> R:
+    """A whole file as a record, with all of these scales but for the lesson, which is not of all notebooks.
+
+    Raises:
+        ParameterError: if the file is missing, damaged or holds a value that cannot be, in one sentence.
+    """
+    record = validate(kind, read_yaml(path), path)
+    for scale in scales:
+        if scale != LESSON and scale not in vars(record)["scales"]:
             raise ParameterError(f"{path}: key 'scales.{scale}': the key is missing")
+    return record
 
 
 def check_length(path: Path, key: str, value: Sized, expected: int, one_a: str = "variable") -> None:

@@ -1,9 +1,9 @@
 """Validated, frozen records of params/limits.yaml: what is attainable, and the alternatives."""
 
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated
 
-from pydantic import Field, Strict, model_validator
+from pydantic import Field, Strict
 
 from helpers.settings.leaf import (
     Count,
@@ -13,12 +13,10 @@ from helpers.settings.leaf import (
     ParameterError,
     Positive,
     Record,
+    Rules,
     Share,
     Text,
-    check_scales,
-    read_yaml,
-    refusal,
-    validate,
+    load_record,
 )
 from helpers.settings.paper import Params
 
@@ -92,11 +90,8 @@ class RobustnessParams(Record):
     improve_state: Annotated[tuple[Positive, ...], Several, Leaf("share of A")]
     improve_input: Annotated[tuple[Positive, ...], Several, Leaf("share of B")]
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        if len(self.improve_state) != len(self.improve_input):
-            raise refusal("'improve_state' and 'improve_input' differ in length")
-        return self
+    def _rules(self) -> Rules:
+        yield len(self.improve_state) != len(self.improve_input), "'improve_state' and 'improve_input' differ in length"
 
 
 class LimitsScaleParams(Record):
@@ -114,13 +109,10 @@ class LimitsScaleParams(Record):
     corners: Annotated[bool, Strict(), Leaf("-")]
     library: Annotated[bool, Strict(), Leaf("-")]
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        if len(self.states) != len(self.inputs):
-            raise refusal("'states' and 'inputs' differ in length")
-        if any(number > self.episodes or number % self.every for number in self.listed):
-            raise refusal("'listed' must hold multiples of 'every' up to 'episodes'")
-        return self
+    def _rules(self) -> Rules:
+        yield len(self.states) != len(self.inputs), "'states' and 'inputs' differ in length"
+        beyond = any(number > self.episodes or number % self.every for number in self.listed)
+        yield beyond, "'listed' must hold multiples of 'every' up to 'episodes'"
 
 
 class LimitsParams(Record):
@@ -139,14 +131,9 @@ class LimitsParams(Record):
 
 
 def load_limits(root: Path, params: Params) -> LimitsParams:
-    """The settings of notebook 06, from limits.yaml, for the process and the scales of a case.
-
-    Raises:
-        ParameterError: if the file is missing, damaged or holds a value that cannot be, in one sentence.
-    """
+    """The settings of notebook 06, from limits.yaml, for the process and the scales of a case."""
     path = root / "limits.yaml"
-    record = validate(LimitsParams, read_yaml(path), path)
-    check_scales(path, params.learning.scales, record.scales)
+    record = load_record(LimitsParams, path, params.learning.scales)
     for name, scale_params in record.scales.items():
         if record.quality.order >= scale_params.at_rest // 2:
             raise ParameterError(f"{path}: key 'quality.order': needs more than twice as many samples as 'scales.{name}.at_rest'")

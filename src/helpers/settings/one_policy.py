@@ -5,19 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from helpers.settings.leaf import (
-    Count,
-    Leaf,
-    Memory,
-    NotNegative,
-    Positive,
-    Record,
-    Share,
-    Text,
-    check_scales,
-    read_yaml,
-    validate,
-)
+from helpers.settings.leaf import Count, Leaf, Memory, NotNegative, Positive, Record, Share, Text, load_record
 from helpers.settings.paper import Params
 
 
@@ -67,12 +55,5 @@ class OnePolicyParams(Record):
 
 
 def load_one_policy(root: Path, params: Params) -> OnePolicyParams:
-    """The settings of notebook 09, from one_policy.yaml.
-
-    Raises:
-        ParameterError: if the file is missing, damaged or holds a value that cannot be, in one sentence.
-    """
-    path = root / "one_policy.yaml"
-    record = validate(OnePolicyParams, read_yaml(path), path)
-    check_scales(path, params.learning.scales, record.scales)
-    return record
+    """The settings of notebook 09, from one_policy.yaml."""
+    return load_record(OnePolicyParams, root / "one_policy.yaml", params.learning.scales)

@@ -4,9 +4,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, Strict, model_validator
+from pydantic import Field, Strict
 
 from helpers.settings.leaf import (
     DEVIATION,
@@ -20,14 +20,13 @@ from helpers.settings.leaf import (
     ParameterError,
     Positive,
     Record,
+    Rules,
     Share,
     Text,
     Vector,
     check_length,
     list_leaves,
     read_yaml,
-    refusal,
-    same_length,
     validate,
 )
 
@@ -62,19 +61,15 @@ class ProcessParams(Record):
     input_high: Annotated[Vector, Leaf(DEVIATION)]
     balance: BalanceParams | None = None
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        n_states = len(self.controlled)
-        n_inputs = len(self.manipulated)
-        same_length(n_states, self, "controlled_description", "drift_state", "drift_input")
-        same_length(n_states, self, "disturbance", "observation_noise")
-        same_length(n_inputs, self, "manipulated_description", "input_low", "input_high")
+    def _rules(self) -> Rules:
+        n_states, n_inputs = len(self.controlled), len(self.manipulated)
+        states = ("controlled_description", "drift_state", "drift_input", "disturbance", "observation_noise")
+        yield from self._lengths(n_states, *states)
+        yield from self._lengths(n_inputs, "manipulated_description", "input_low", "input_high")
         for name, width in (("drift_state", n_states), ("drift_input", n_inputs)):
-            if any(len(row) != width for row in getattr(self, name)):
-                raise refusal(f"'{name}' has a row whose length is not {width}")
-        if any(low >= high for low, high in zip(self.input_low, self.input_high, strict=True)):
-            raise refusal("'input_low' must lie below 'input_high' for every input")
-        return self
+            yield any(len(row) != width for row in getattr(self, name)), f"'{name}' has a row whose length is not {width}"
+        crossed = any(low >= high for low, high in zip(self.input_low, self.input_high, strict=True))
+        yield crossed, "'input_low' must lie below 'input_high' for every input"
 
 
 class GainParams(Record):
@@ -84,10 +79,8 @@ class GainParams(Record):
     integral: Annotated[Vector, Leaf("input/(output time)")]
     derivative: Annotated[Vector, Leaf("input time/output")]
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        same_length(len(self.proportional), self, "integral", "derivative")
-        return self
+    def _rules(self) -> Rules:
+        yield from self._lengths(len(self.proportional), "integral", "derivative")
 
 
 class FeatureParams(Record):
@@ -106,11 +99,9 @@ class ExplorationParams(Record):
     std_high: Annotated[Positive, Leaf("input range")]
     initial_std: Annotated[Positive, Leaf("input range")]
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if not self.std_low <= self.initial_std <= self.std_high or self.std_low == self.std_high:
-            raise refusal("expected std_low <= initial_std <= std_high and std_low < std_high")
-        return self
+    def _rules(self) -> Rules:
+        ordered = self.std_low <= self.initial_std <= self.std_high and self.std_low != self.std_high
+        yield not ordered, "expected std_low <= initial_std <= std_high and std_low < std_high"
 
 
 class PolicyParams(ExplorationParams):
@@ -135,11 +126,8 @@ class ScaleParams(Record):
     epoch_share: Annotated[Share, Leaf("-")]
     online_share: Annotated[Share, Leaf("-")] | None = None
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        if self.episodes + self.measured > EPISODES_PER_EPOCH:
-            raise refusal(f"'episodes' and 'measured' exceed {EPISODES_PER_EPOCH} an epoch")
-        return self
+    def _rules(self) -> Rules:
+        yield self.episodes + self.measured > EPISODES_PER_EPOCH, f"'episodes' and 'measured' exceed {EPISODES_PER_EPOCH} an epoch"
 
 
 class LearnerParams(Record):
@@ -171,11 +159,8 @@ class WeightParams(Record):
     keep_nearest: Annotated[bool, Strict(), Leaf("-")]
     selection_memory: Annotated[Memory, Leaf("-")]
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        if not any(self.initial):
-            raise refusal("'initial' holds zeros only, which have no direction")
-        return self
+    def _rules(self) -> Rules:
+        yield not any(self.initial), "'initial' holds zeros only, which have no direction"
 
 
 class VariantParams(Record):
@@ -242,13 +227,9 @@ class LearningParams(Record):
         """Episodes of an epoch at the smallest scale, which every minibatch must share."""
         return min(scale.episodes for scale in self.scales.values())
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        fewest = self.fewest_episodes
-        for learner in (self.online.learner, *(variant.learner for variant in self.variants.values())):
-            if learner.minibatches > fewest:
-                raise refusal(f"'minibatches' exceeds the {fewest} episodes of a scale")
-        return self
+    def _rules(self) -> Rules:
+        most = max(learner.minibatches for learner in (self.online.learner, *(of.learner for of in self.variants.values())))
+        yield most > self.fewest_episodes, f"'minibatches' exceeds the {self.fewest_episodes} episodes of a scale"
 
 
 class OfflineParams(Record):
@@ -258,11 +239,8 @@ class OfflineParams(Record):
     iterations: Annotated[Count, Leaf("iterations")]
     transfer_from: Annotated[Count, Leaf("case")] | None = None
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        if self.iterations > self.epochs:
-            raise refusal("'iterations' exceeds 'epochs'")
-        return self
+    def _rules(self) -> Rules:
+        yield self.iterations > self.epochs, "'iterations' exceeds 'epochs'"
 
 
 class OnlineParams(Record):
@@ -272,10 +250,8 @@ class OnlineParams(Record):
     beta: Annotated[tuple[Positive, ...], Field(min_length=1), Leaf("-")]
     headline_beta: Annotated[Positive, Leaf("-")]
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        same_length(len(self.epochs), self, "beta")
-        return self
+    def _rules(self) -> Rules:
+        yield from self._lengths(len(self.epochs), "beta")
 
 
 class CaseParams(Record):
@@ -291,15 +267,11 @@ class CaseParams(Record):
     offline: OfflineParams
     online: OnlineParams
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        if len(self.steady_state) != len(self.set_point):
-            raise refusal("'set_point' and 'steady_state' differ in length")
-        if self.error_scale is not None:
-            same_length(len(self.set_point), self, "error_scale")
-        elif any(target == rest for target, rest in zip(self.set_point, self.steady_state, strict=True)):
-            raise refusal("'set_point' equals 'steady_state' in a loop, so the error has no scale: give 'error_scale'")
-        return self
+    def _rules(self) -> Rules:
+        yield len(self.steady_state) != len(self.set_point), "'set_point' and 'steady_state' differ in length"
+        equal = "'set_point' equals 'steady_state' in a loop, so the error has no scale: give 'error_scale'"
+        yield not all(self.scale_of_error), equal
+        yield from self._lengths(len(self.set_point), *([] if self.error_scale is None else ["error_scale"]))
 
     @property
     def scale_of_error(self) -> tuple[float, ...]:
@@ -317,10 +289,8 @@ class PublishedCase(Record):
     policy: Vector
     alpha: Vector
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        same_length(len(self.expert), self, "policy", "alpha")
-        return self
+    def _rules(self) -> Rules:
+        yield from self._lengths(len(self.expert), "policy", "alpha")
 
     @property
     def feature_gap(self) -> float:

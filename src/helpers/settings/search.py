@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, Strict
 
-from helpers.settings.leaf import Count, Leaf, Positive, Record, Share, Text, Vector, read_yaml, refusal, validate
+from helpers.settings.leaf import Count, Leaf, Positive, Record, Share, Text, Vector, load_record, refusal
 
 
 def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
@@ -66,10 +66,5 @@ class PrintedSearchParams(Record):
 
 
 def load_search(root: Path) -> PrintedSearchParams:
-    """The settings of the search, from search.yaml.
-
-    Raises:
-        ParameterError: if the file is missing, damaged or holds a value that cannot be, in one sentence.
-    """
-    path = root / "search.yaml"
-    return validate(PrintedSearchParams, read_yaml(path), path)
+    """The settings of the search, from search.yaml."""
+    return load_record(PrintedSearchParams, root / "search.yaml")

@@ -140,10 +140,16 @@ def one_step(process: LinearProcess, task: ControlTask, beta: float, axes: Seque
             expected += weight * _basis(points, at).toarray()
         over_moves = np.moveaxis(expected.reshape(len(states), len(moves), len(points)), 1, 0)
         transition.append(np.moveaxis(make_interp_spline(moves, over_moves, DEGREE).c, 0, 1))
-    combined = np.ones((len(flat), 1))
+    # Row by row the products of the few splines that are not nought at a move.
+    values, columns = np.ones((len(flat), 1)), np.zeros((len(flat), 1), dtype=int)
     for moves, column in zip(lattice, flat.T, strict=True):
-        combined = (combined[:, :, None] * _basis(moves, column).toarray()[:, None]).reshape(len(flat), -1)
-    return OneStep(inputs, np.concatenate(reward), tuple(transition), csr_array(combined))
+        basis = _basis(moves, column)
+        inner, place = (part.reshape(len(flat), 1, -1) for part in (basis.data, basis.indices))
+        values = (values[:, :, None] * inner).reshape(len(flat), -1)
+        columns = (columns[:, :, None] * len(moves) + place).reshape(len(flat), -1)
+    rows = np.arange(0, values.size + 1, values.shape[1])
+    combined = csr_array((values.ravel(), columns.ravel(), rows), shape=(len(flat), resolution.inputs ** len(lattice)))
+    return OneStep(inputs, np.concatenate(reward), tuple(transition), combined)
 
 
 def _moments(process: LinearProcess, x: Array, u: Array) -> tuple[Array, Array, Array]:

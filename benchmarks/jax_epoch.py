@@ -22,7 +22,7 @@ class JaxLearner:
         names = ("drift_state", "drift_input", "disturbance_gain", "observation_noise")
         process = learner.process
         assert isinstance(process, LinearProcess)
-        self.steps, self.h = process.integration_steps, process.sampling_time / process.integration_steps
+        self.steps, self.tau = process.integration_steps, process.tau
         self.process: dict[str, np.ndarray] = {name: getattr(process, name).numpy() for name in names}
         self.task = {name: value.numpy() for name, value in vars(self.features.task).items() if name != "n_steps"}
         self.task["error_unit"] = learner.policy.error_unit.numpy()
@@ -68,7 +68,7 @@ class JaxLearner:
             after = x
             for w in jnp.split(disturbance, self.steps, axis=-1):
                 drift = after @ process["drift_state"].T + u @ process["drift_input"].T
-                after = after + drift * self.h + process["disturbance_gain"] * self.h**0.5 * after * w
+                after = after + drift * self.tau + process["disturbance_gain"] * self.tau**0.5 * after * w
             seen = after * (1 + process["observation_noise"] * sensors)
             return (after, seen, u, following), (log_probability, {"x": after, "y": y, "u": u, "command": command})
 

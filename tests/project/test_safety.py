@@ -41,7 +41,7 @@ def test_a_module_has_no_way_to_a_network_and_no_loader_that_runs_code(path):
 
 
 ESCAPES = {
-    "variant": ["../../../etc", "improved/../../x", "/tmp/x", "..", ""],
+    "variant": ["../../../etc", "improved/../../x", "/x", "..", ""],
     "scale": ["../paper", "smoke/..", "/", ""],
     "seed": ["0/../../x", "../1", -1, 1.0],
     "case": ["../1", "1/../../x", -1, 0, 10**9],

@@ -82,7 +82,7 @@ def test_new_results_take_the_place_of_all_older_ones(saved):
     assert [path.name for path in save_stage(saved.folder, {}, {"other.csv": AWKWARD}).folder.glob("*.csv")] == ["other.csv"]
 
 
-@pytest.mark.parametrize("name", ["../table.csv", "/tmp/table.csv", "deep/table.csv", ".."])
+@pytest.mark.parametrize("name", ["../table.csv", "/table.csv", "deep/table.csv", ".."])
 def test_a_file_name_cannot_lead_out_of_the_folder(folder, name):
     assert "leads out" in refusal(save_stage, folder, {}, {name: AWKWARD})
     assert not folder.parent.exists()

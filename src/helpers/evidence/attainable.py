@@ -161,8 +161,7 @@ def _moments(process: LinearProcess, x: Array, u: Array) -> tuple[Array, Array, 
     dtype = process.state_step.dtype
     mean, entry = (torch.from_numpy(np.broadcast_to(part, (*shape, part.shape[-1])).copy()).to(dtype) for part in (x, u))
     covariance, third = torch.zeros_like(mean).diag_embed(), torch.zeros_like(mean)
-    tau = process.sampling_time / process.integration_steps
-    kept, kick = 1 + tau * process.drift_state.diagonal(), tau * process.disturbance_gain**2
+    kept, kick = 1 + process.tau * process.drift_state.diagonal(), process.tau * process.disturbance_gain**2
     for _ in range(process.integration_steps):
         # Of a x + c + s x w with w ~ N(0, 1): E[(x - m) x^2] is the third moment plus twice mean times variance.
         twice = 2 * mean * covariance.diagonal(dim1=-2, dim2=-1)

@@ -28,7 +28,7 @@ class TrackingEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.beta = beta
         self.n_steps = task.n_steps
         self.drift_state, self.drift_input = process.drift_state.double().numpy(), process.drift_input.double().numpy()
-        self.n_integration, self.h = process.integration_steps, process.sampling_time / process.integration_steps
+        self.integration_steps, self.tau = process.integration_steps, process.tau
         self.disturbance_gain = process.disturbance_gain.double().numpy()
         self.observation_noise = process.observation_noise.double().numpy()
         self.set_point, self.error_scale = task.set_point.double().numpy(), task.error_scale.double().numpy()
@@ -61,9 +61,9 @@ class TrackingEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """One sample of the whole batch: what is seen, and the rewards of shape batch, from actions (*batch, n_u)."""
         self.u = self.middle + self.half * np.clip(action, -1.0, 1.0)
         pushed = self.u @ self.drift_input.T
-        for w in self.np_random.standard_normal((self.n_integration, *self.x.shape)):
+        for w in self.np_random.standard_normal((self.integration_steps, *self.x.shape)):
             drift = self.x @ self.drift_state.T + pushed
-            self.x = self.x + drift * self.h + self.disturbance_gain * self.x * self.h**0.5 * w
+            self.x = self.x + drift * self.tau + self.disturbance_gain * self.x * self.tau**0.5 * w
         self.t += 1
         return self._seen(), np.exp(-((self.beta * (self.set_point - self.x) / self.error_scale) ** 2)).sum(-1)
 

@@ -166,14 +166,13 @@ class ReadProcess(LinearProcess):
     def step(self, x: Tensor, u: Tensor, noise: Tensor) -> Tensor:
         """The state at the next sample."""
         reading, still = self.reading, torch.zeros_like(x)
-        tau = self.sampling_time / self.integration_steps
-        spread = self.disturbance_gain * tau**0.5
+        spread = self.disturbance_gain * self.tau**0.5
         behind = reading.disturbance == "behind"
         for drawn in noise.split(self.n_states, dim=1):
             w = drawn[:, :1].expand_as(drawn) if reading.one_disturbance else drawn
             if reading.disturbance == "milstein":
                 w = w + spread * (w**2 - 1) / 2
-            w = w * tau ** (reading.disturbance_power - 0.5)
+            w = w * self.tau ** (reading.disturbance_power - 0.5)
             x = self._integrated(x, u, still if behind or reading.disturbance == "once" else w)
             if behind:
                 x = x * (1 + spread * w)

@@ -50,12 +50,16 @@ class LinearProcess:
         self.observation_noise = torch.tensor(params.observation_noise, dtype=dtype)
         self._compose()
 
+    @property
+    def tau(self) -> float:
+        """The length of a step of integration."""
+        return self.sampling_time / self.integration_steps
+
     def _compose(self) -> None:
         """The matrices of a step of integration and of a sample."""
-        tau = self.sampling_time / self.integration_steps
-        self._spread = self.disturbance_gain * tau**0.5
-        self._state = torch.eye(self.n_states, dtype=self.drift_state.dtype) + self.drift_state * tau
-        self._entry = self.drift_input * tau
+        self._spread = self.disturbance_gain * self.tau**0.5
+        self._state = torch.eye(self.n_states, dtype=self.drift_state.dtype) + self.drift_state * self.tau
+        self._entry = self.drift_input * self.tau
         self.state_step, self.input_step = self._state, self._entry
         for _ in range(self.integration_steps - 1):
             self.state_step, self.input_step = self._state @ self.state_step, self._state @ self.input_step + self._entry

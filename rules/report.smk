@@ -1,7 +1,8 @@
 # The report, and what it reads.
 
-# Of make bench, which may not have been run: what the report shows of it.
-BENCHMARKS = [ROOT / "reports/reference/benchmarks" / name for name in ("summary.md", "machine.md", "scaling.svg")]
+# Of make bench and make search, which may not have been run: what the report shows of them.
+APART = [*(f"benchmarks/{name}" for name in ("summary.md", "machine.md", "scaling.svg")), "search/record.json"]
+APART = [ROOT / "reports/reference" / name for name in APART]
 
 
 def read_of_seed(seed):
@@ -28,7 +29,7 @@ rule report:
     input:
         made_from("05_report", f"{REPORTS}/provenance.json"),
         template=[str(path) for path in sorted((ROOT / "reports/template").iterdir())],
-        benchmarks=[str(path) for path in BENCHMARKS if path.is_file()],
+        apart=[str(path) for path in APART if path.is_file()],
         stages=finished,
     output:
         f"{REPORTS}/report.html",

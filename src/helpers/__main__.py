@@ -9,7 +9,7 @@ COMMANDS = {
     "run": ("helpers.runs.run", "one notebook, by papermill"),
     "refresh": ("helpers.runs.refresh", "all notebooks at their defaults, and their outputs stored in them"),
     "publish": ("helpers.report.publish", "the last report becomes the committed reference"),
-    "search": ("helpers.report.search_report", "the printed algorithms' best settings, a run of hours that can be stopped"),
+    "search": ("helpers.evidence.search", "the printed algorithms' best settings, a run of hours that can be stopped"),
     "verdicts": ("helpers.report.verdicts", "every verdict of a published report again, from its CSV files alone"),
     "plant": ("helpers.report.plant_report", "from the historian file of your own plant to a controller"),
 }

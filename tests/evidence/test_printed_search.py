@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from helpers.evidence import printed_search, weights_set
+from helpers.evidence import search as command
 from helpers.evidence.printed_search import Search, design
 from helpers.plant.rollout import stream
 from helpers.report import search_report
@@ -78,19 +79,26 @@ def test_rungs_keep_the_best_and_a_stopped_search_goes_on(search, made):
     assert all(started for case, *_, started in made if case == 3)
 
 
-def test_the_command_writes_every_trial_the_weights_and_both_figures(made, tmp_path, monkeypatch):
+def test_the_command_writes_every_trial_and_the_weights_and_the_report_draws_them(made, root, tmp_path, monkeypatch):
     monkeypatch.setattr(weights_set, "relearnt", lambda study, weights, *size: 10 * weights)
     with pytest.raises(KeyboardInterrupt):
-        search_report.search("smoke", [1, 2, 3], tmp_path)
-    search_report.search("smoke", [1, 2, 3], tmp_path)
+        command.search("smoke", [1, 2, 3], tmp_path)
+    command.search("smoke", [1, 2, 3], tmp_path)
     stage = load_stage(tmp_path / "smoke/search", "the search")
-    assert {"gaps.svg", "weights.svg"} < set(stage.record["files"])
-    trials, best = stage.table("trials.csv"), stage.table("best.csv")
+    trials = stage.table("trials.csv")
+    best = search_report.best_of(trials)
     assert len(trials) == 3 * 10
     assert {"case", "setting", "seed", "gap", "iterations", "epochs", "seconds", *RangeParams.model_fields} < set(trials)
     assert best.groupby("case")["median"].apply(list).tolist() == [[0.5, 0.2]] * 3  # by hand, and the best
     printed = stage.table("weights.csv").query("kind == 'printed'").filter(like="alpha:").to_numpy()
-    np.testing.assert_allclose(printed[0], load_published(search_report.PARAMS)[1].alpha, atol=1e-3)
+    published = load_published(root)
+    np.testing.assert_allclose(printed[0], published[1].alpha, atol=1e-3)
+    told = search_report.tabulate(stage, published).set_index("case")
+    assert told[["settings", "trials", "seeds", "by_hand", "best"]].to_numpy().tolist() == [[5, 10, 3, 50, 20]] * 3
+    assert told["paper"].tolist() == [100 * published[case].feature_gap for case in (1, 2, 3)]
+    figures = search_report.draw(stage, published, trials[["case", *stage.table("weights.csv").filter(like="alpha:")]])
+    for figure in figures.values():
+        assert len(figure.axes) == 3
 
 
 def test_relearning_meets_the_closed_loop_of_the_policy_and_climbs(search):

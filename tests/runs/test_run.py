@@ -303,6 +303,7 @@ RESULTS = {  # by rule of the Snakefile: the notebook, case and variant of each 
 EVERYTHING = {rule: len(results) for rule, results in RESULTS.items()}
 LEARNT = {rule: number for rule, number in EVERYTHING.items() if rule != "report"}
 ADDED = None  # in place of words to replace: a line at the end
+PRINTED_IN_CASE = "variants: {printed: {weights: {step: {value: 0.1, unit: '-', source: a test, status: assumed}}}}\n"
 
 
 def edited(text, old, new):
@@ -315,6 +316,7 @@ def edited(text, old, new):
 
 EDITS = [
     ("params/case_2.yaml", "250", "249", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
+    ("params/case_2.yaml", ADDED, PRINTED_IN_CASE, {"offline": 1, "report": 1}),
     ("params/learning.yaml", "std_high: {value: 0.25", "std_high: {value: 0.3", ONLINE),
     ("params/learning.yaml", "episodes: {value: 400", "episodes: {value: 300", {"report": 1}),  # of another scale
     ("params/published.yaml", "21.63", "21.64", {"report": 1}),

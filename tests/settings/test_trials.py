@@ -8,7 +8,7 @@ import torch
 
 from helpers.runs.opening import parameters_hash
 from helpers.runs.request import SessionError, check_parameters
-from helpers.settings.leaf import read_yaml
+from helpers.settings.leaf import ParameterError, read_yaml
 from helpers.settings.paper import TrialParams, load, load_trials
 from tests.runs.test_study import session
 from tests.settings.test_params import DELETE, edit, folder, leaf, refusal  # noqa: F401  (a fixture)
@@ -54,11 +54,38 @@ def test_trials_leave_the_variants_the_leaves_and_their_hash_alone(folder, root)
     assert load(folder, 1).learning.variants == {name: before.learning.variants[name] for name in ("improved", "printed")}
 
 
-def test_the_variants_of_the_paper_use_none_of_the_optional_settings(root):
-    learning = load(root, 1).learning
-    for name in ("improved", "printed"):
-        variant = learning.variants[name]
-        assert (variant.exploration, variant.learner.entropy) == (None, 0)
+def test_a_case_may_change_a_variant_and_no_other_case_sees_it(folder, root):  # noqa: F811
+    changes = {"weights": {"step": leaf(0.2)}, "episodes": leaf(30, "episodes")}
+    edit(folder / "case_2.yaml", {"variants": {"improved": changes}})
+    before, own, other = load(root, 2).learning, load(folder, 2).learning, load(folder, 1).learning
+    improved = before.variants["improved"]
+    expected = improved.model_copy(update={"episodes": 30, "weights": improved.weights.model_copy(update={"step": 0.2})})
+    assert own.variants["improved"] == expected
+    assert other.variants["improved"] == improved
+    assert own.variants["constant_step"] == before.variants["constant_step"]  # a trial changes the variant of learning.yaml
+
+
+@pytest.mark.parametrize(
+    ("variants", "key", "says"),
+    [
+        ({"best": {"weights": {}}}, "variants.best", "improved, printed"),
+        ({"printed": 3}, "variants.printed", "keys and values"),
+        ({"printed": {"weights": {"pace": leaf(0.1)}}}, "variants.printed.weights.pace", "unknown"),
+        ({"printed": {"learner": {"minibatches": leaf(41, "per pass")}}}, "variants.printed.learner.minibatches", "40 episodes"),
+    ],
+)
+def test_a_wrong_variant_of_a_case_is_named(folder, variants, key, says):  # noqa: F811
+    edit(folder / "case_2.yaml", {"variants": variants})
+    with pytest.raises(ParameterError) as caught:
+        load(folder, 2)
+    for word in ("case_2.yaml", f"'{key}'", says):
+        assert word in str(caught.value)
+
+
+def test_the_headline_variant_uses_none_of_the_optional_settings(root):
+    for case in (1, 2, 3):
+        variant = load(root, case).learning.variants["improved"]
+        assert (variant.exploration, variant.episodes, variant.learner.entropy) == (None, None, 0)
 
 
 REFUSED = [

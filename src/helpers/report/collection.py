@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from helpers.learning.features import feature_names
-from helpers.report import claims, scorecard
+from helpers.report import claims, scorecard, search_report
 from helpers.runs.artifacts import RECORD, Stage, load_stage
 from helpers.runs.freshness import check
 from helpers.runs.identity import inputs
@@ -44,6 +44,7 @@ class Results:
         inferred: what notebook 00 wrote, if it was run.
         limits: by case, seed and part of notebook 06, where it was run to its end.
         one_policy, own_plant: summary.csv of notebook 09 and scores.csv of notebook 07 with a column seed; empty where not run.
+        search: what `make search` wrote, if it was run.
         beyond: every stage beyond the paper's own runs, those of claims, budget, trials, limits and inferred settings.
     """
 
@@ -60,6 +61,7 @@ class Results:
     limits: Mapping[tuple[int, int, str], Stage] = field(default_factory=dict)
     one_policy: pd.DataFrame = field(default_factory=pd.DataFrame)
     own_plant: pd.DataFrame = field(default_factory=pd.DataFrame)
+    search: Stage | None = None
     beyond: tuple[Stage, ...] = ()
     made_from: Mapping[str, str] = field(default_factory=dict)
     missing: tuple[int, ...] = ()
@@ -180,6 +182,7 @@ def collect(
         limits=limits,
         one_policy=stacked(one_policy, "summary.csv"),
         own_plant=stacked(own_plant, "scores.csv"),
+        search=load_stage(search_report.FOUND, "make search") if (search_report.FOUND / RECORD).is_file() else None,
         beyond=beyond,
         made_from=inputs(REPORT, params_root, scale),
         missing=tuple(seed for seed in range(n_seeds) if seed not in seeds_found),

@@ -16,7 +16,17 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from helpers.evidence.readings import MAIN
-from helpers.report import drawings, figures, limits_findings, limits_report, scorecard, statistics, tables, verdict_figures
+from helpers.report import (
+    drawings,
+    figures,
+    limits_findings,
+    limits_report,
+    scorecard,
+    search_report,
+    statistics,
+    tables,
+    verdict_figures,
+)
 from helpers.report.collection import ONLINE, Results, offline_folder
 from helpers.report.limits_figures import GRIDS, LABELS, RIVALS
 from helpers.report.typesetting import render, shortened, to_html, to_pdf
@@ -81,6 +91,10 @@ def draw(results: Results, compared: pd.DataFrame) -> dict[str, Figure]:
         drawn["online_budget"] = figures.budget_figure(results.budget, levels, titles)
     if len(results.claims):
         drawn["claims"] = verdict_figures.claims_figure(scorecard.claims_by_case(results.claims))
+    if results.search is not None:
+        weights = results.seeds[(results.seeds["stage"] == "offline") & results.seeds["metric"].str.startswith("alpha:")]
+        weights = weights.pivot_table(index=["case", "seed"], columns="metric", values="value").reset_index()
+        drawn |= search_report.draw(results.search, results.published, weights)
     drawn |= limits_report.draw(results)
     return {f"figure_{OF_THE_PAPER[name]}" if name in OF_THE_PAPER else name: figure for name, figure in drawn.items()}
 
@@ -122,6 +136,8 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
         trials = tables.trials_table(results.trials)
         words = scorecard.against_headline(results.trials)
         tabulated["trials"] = trials.assign(against_improved=trials["trial"].map(words).fillna(tables.NOT_KNOWN))
+    if results.search is not None:
+        tabulated["search"] = search_report.tabulate(results.search, results.published)
     if results.inferred is not None:
         for name in ("settings", "hypotheses", "prediction"):
             tabulated[f"inferred_{name}"] = results.inferred.table(f"{name}.csv")
@@ -245,6 +261,7 @@ def said(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mappin
         "of_the_paper": {case: OF_THE_PAPER[f"control_case_{case}"] for case in results.params},
         "benchmarks": benchmarks,
         "claims": tabulated.get("claims_by_case"),
+        "search": tabulated["search"].set_index("case").to_dict("index") if "search" in tabulated else {},
         "frozen": _frozen(results),
         "limits": limits,
         "rivals": {name: LABELS[name] for name in RIVALS},

@@ -1,30 +1,19 @@
-"""The search for the printed algorithms' best settings, and the sample of weights: `python -m helpers search`.
+"""What `make search` found: the printed algorithms' best settings, and which reward weights lead near the expert."""
 
-A run of its own: it takes hours, goes on where it was stopped, and writes reports/reference/search, which the report shows.
-"""
-
-import argparse
-import sys
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
-import torch
 from matplotlib.figure import Figure
 
-from helpers.evidence.printed_search import Search
-from helpers.evidence.weights_set import sampled
-from helpers.report.figures import INK, LEVEL, LOOP_COLOURS, MUTED, WIDTH, empty_figure, head, lay_out
+from helpers.report.figures import INK, LEVEL, LOOP_COLOURS, MUTED, WIDTH, empty_figure, head
 from helpers.report.tables import case_study, feature_symbol
-from helpers.runs.artifacts import code_revision, save_stage
-from helpers.runs.identity import versions
+from helpers.runs.artifacts import Stage
 from helpers.runs.sources import PROJECT
-from helpers.settings.leaf import InputError
-from helpers.settings.paper import HEADLINE, PublishedCase, load_published
+from helpers.settings.paper import HEADLINE, PublishedCase
 
-PARAMS, REFERENCE = PROJECT / "params", PROJECT / "reports/reference"
-DECIMALS, FEWEST = 6, 10
+FOUND = PROJECT / "reports/reference/search"  # a run of its own
+FEWEST = 10  # of the sampled weights, shown in any case
 WORST = 10.0  # gaps beyond are drawn here
 
 
@@ -93,48 +82,34 @@ def weights_figure(weights: pd.DataFrame, learnt: Mapping[str, pd.DataFrame], pu
     return figure
 
 
-def headline_weights(seeds: Path) -> pd.DataFrame:
-    """alpha* of the headline variant over its seeds, from the seeds.csv of a report: case and alpha:<feature>."""
-    rows = pd.read_csv(seeds).query("stage == 'offline' and metric.str.startswith('alpha:')")
-    return rows.pivot_table(index=["case", "seed"], columns="metric", values="value").reset_index()
+def draw(found: Stage, published: Mapping[int, PublishedCase], headline: pd.DataFrame) -> dict[str, Figure]:
+    """Both figures of a search by name.
 
-
-def search(scale: str, cases: Sequence[int], results: Path) -> None:
-    """Search all cases given; with all of them done, write trials, weights and figures."""
-    torch.set_num_threads(1)
-    kept, published = Search(PARAMS, scale, results / scale / ".search"), load_published(PARAMS)
-    best: dict[int, int] = {}
-    trials, weights = [], []
-    for case in sorted(cases):
-        best[case], table = kept.run(case, best)
-        trials.append(table)
-        weights.append(sampled(kept, case))
-    if set(cases) < set(published):
-        return
-    tried, drawn = pd.concat(trials), pd.concat(weights)
-    tables = {"trials.csv": tried, "weights.csv": drawn, "best.csv": best_of(tried)}
+    Args:
+        headline: alpha* of the headline variant over seeds, columns case and alpha:<feature>.
+    """
+    trials, weights = found.table("trials.csv"), found.table("weights.csv")
+    best = best_of(trials).groupby("case")["setting"].last()
     learnt = {
-        r"$\alpha^*$ as printed, best settings": tried[tried["setting"] == tried["case"].map(best)],
-        rf"$\alpha^*$, {HEADLINE}": headline_weights(REFERENCE / "seeds.csv"),
+        r"$\alpha^*$ as printed, best settings": trials[trials["setting"] == trials["case"].map(best)],
+        rf"$\alpha^*$, {HEADLINE}": headline,
     }
-    figures = {"gaps": gap_figure(tried, published), "weights": weights_figure(drawn, learnt, published)}
-    for figure in figures.values():
-        lay_out(figure)
-    folder = REFERENCE / "search" if scale == "paper" else results / scale / "search"
-    short = {name: table.round(DECIMALS).astype(object) for name, table in tables.items()}  # as they are, and not with 17 digits
-    save_stage(folder, {"revision": code_revision(PROJECT), "versions": versions()}, short, figures=figures)
-    print(f"written: {folder}")
+    return {"search_gaps": gap_figure(trials, published), "search_weights": weights_figure(weights, learnt, published)}
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m helpers search", description=__doc__)
-    parser.add_argument("cases", nargs="*", type=int, help="all, unless given; a case that starts from another one needs that too")
-    parser.add_argument("--scale", default="paper", choices=("paper", "smoke"))
-    given = parser.parse_args(arguments)
-    try:
-        search(given.scale, given.cases or sorted(load_published(PARAMS)), PROJECT / "results")
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+def tabulate(found: Stage, published: Mapping[int, PublishedCase]) -> pd.DataFrame:
+    """A row for each case: how many settings and trials, gaps in per cent of the settings by hand and of the best, and the weights.
+
+    `fresh` is the gap of the best over the seeds by which it was not chosen; `within` counts the sampled weights whose best policy
+    lies within the paper's own gap, of `sampled`; `printed` is the gap of the policy that is best under the printed weights.
+    """
+    trials, weights = found.table("trials.csv"), found.table("weights.csv")
+    ends = best_of(trials).groupby("case")
+    tried, printed = (weights[(weights["kind"] == "printed") == which] for which in (False, True))
+    papers = pd.Series({case: record.feature_gap for case, record in published.items()})
+    within, of_case = (tried["gap"] <= tried["case"].map(papers)).groupby(tried["case"]), trials.groupby("case")
+    gaps = {"paper": papers, "by_hand": ends["median"].first(), "best": ends["median"].last(), "fresh": ends["fresh"].last()}
+    rows = {"settings": of_case["setting"].nunique(), "trials": of_case.size(), "seeds": ends["count"].last()}
+    rows |= {name: 100 * of_cases for name, of_cases in gaps.items()}
+    rows |= {"within": within.sum(), "sampled": within.size(), "printed": 100 * printed.groupby("case")["gap"].median()}
+    return pd.DataFrame(rows).rename_axis("case").reset_index()

@@ -101,12 +101,11 @@ def _read_by(
     notebook: str, name: str, values: Mapping[str, Any], params_root: Path, scale: str, case: int | None, variant: str
 ) -> dict[str, Any]:
     """The values of one file that a run reads: its own scale, variant and demonstrator, not those of others."""
-    only: dict[str, str] = {}
+    base = variant
+    if _is_trial(params_root, variant):
+        base = str(dict(_values(read_yaml(params_root / "trials.yaml"))).get(f"{variant}.base"))
+    only = {"scales": scale, "variants": base} if name == "learning" or name.startswith("case_") else {}
     if name == "learning":
-        base = variant
-        if _is_trial(params_root, variant):
-            base = str(dict(_values(read_yaml(params_root / "trials.yaml"))).get(f"{variant}.base"))
-        only = {"scales": scale, "variants": base}
         values = {key: value for key, value in values.items() if key.split(".")[0] not in UNREAD.get(notebook, ())}
     elif name == "demonstrators":
         own = dict(_values(read_yaml(params_root / f"case_{case}.yaml"))).get("demonstrator")

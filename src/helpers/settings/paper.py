@@ -255,7 +255,10 @@ class OnlineParams(Record):
 
 
 class CaseParams(Record):
-    """params/case_<n>.yaml: Table 1 and the settings of one case study."""
+    """params/case_<n>.yaml: Table 1 and the settings of one case study.
+
+    `variants` holds the leaves in which a variant of learning.yaml differs in this case, as the file has them.
+    """
 
     title: Annotated[Text, Leaf("-")]
     demonstrator: Annotated[Text, Leaf("-")]
@@ -266,6 +269,7 @@ class CaseParams(Record):
     initial_std: Annotated[tuple[NotNegative, ...], Leaf(DEVIATION)]
     offline: OfflineParams
     online: OnlineParams
+    variants: dict[Text, dict[Text, dict[str, Any]]] = Field(default_factory=dict, repr=False)
 
     def _rules(self) -> Rules:
         yield len(self.steady_state) != len(self.set_point), "'set_point' and 'steady_state' differ in length"
@@ -356,8 +360,15 @@ def load(root: Path, case: int) -> Params:
         path = root / "process.yaml"
         raise ParameterError(f"{path}: key 'manipulated': a PID pairs {n_controlled} loops, found {n_manipulated} inputs")
     leaves = tuple(row for name in names for row in list_leaves(raw[name], name))
-    trials = load_trials(root)
-    variants = {name: _trial_variant(root, name, trial, learning, raw["learning.yaml"]) for name, trial in trials.items()}
+    trials, bases = load_trials(root), raw["learning.yaml"]["variants"]
+    variants = {
+        name: _variant(bases, name, changes, learning, case_file, f"variants.{name}") for name, changes in record.variants.items()
+    }
+    for name, trial in trials.items():
+        if name in bases:
+            path, known = root / "trials.yaml", ", ".join(bases)
+            raise ParameterError(f"{path}: key '{name}': a trial needs a name other than those of the variants, {known}")
+        variants[name] = _variant(bases, trial.base, trial.changes, learning, root / "trials.yaml", name, f"{name}.base")
     return Params(
         process=process,
         demonstrator=gains,
@@ -382,20 +393,23 @@ def load_trials(root: Path) -> dict[str, TrialParams]:
     return trials
 
 
-def _trial_variant(root: Path, name: str, trial: TrialParams, learning: LearningParams, raw: dict[str, Any]) -> VariantParams:
-    """The variant that a trial's changes make of its base; `raw` is the content of learning.yaml."""
-    path = root / "trials.yaml"
-    known = ", ".join(learning.variants)
-    if name in learning.variants:
-        raise ParameterError(f"{path}: key '{name}': a trial needs a name other than those of the variants, {known}")
-    if trial.base not in learning.variants:
-        raise ParameterError(f"{path}: key '{name}.base': expected one of {known}, found '{trial.base}'")
-    base = raw["variants"][trial.base]
-    merged = base | {part: base.get(part, {}) | changes for part, changes in trial.changes.items()}
-    variant = validate(VariantParams, merged, path, name)
+def _variant(
+    bases: Mapping[str, Any],
+    name: str,
+    changes: Mapping[str, Mapping[str, Any]],
+    learning: LearningParams,
+    path: Path,
+    key: str,
+    named: str | None = None,
+) -> VariantParams:
+    """What changes in a file make of a variant as learning.yaml has it; `named`: the key that names the variant, if not `key`."""
+    if name not in bases:
+        raise ParameterError(f"{path}: key '{named or key}': expected one of {', '.join(bases)}, found '{name}'")
+    variant = validate(
+        VariantParams, bases[name] | {part: bases[name].get(part, {}) | new for part, new in changes.items()}, path, key
+    )
     if variant.learner.minibatches > learning.fewest_episodes:
-        key = f"{name}.learner.minibatches"
-        raise ParameterError(f"{path}: key '{key}': exceeds the {learning.fewest_episodes} episodes of a scale")
+        raise ParameterError(f"{path}: key '{key}.learner.minibatches': exceeds the {learning.fewest_episodes} episodes of a scale")
     return variant
 
 

@@ -16,7 +16,7 @@ SNAKEMAKE = $(BIN)/python -m snakemake --profile profiles/local --cores $(CORES)
 # Tests of numbers: what another processor may round otherwise.
 NUMERICAL := tests/plant tests/learning tests/evidence tests/own_plant tests/runs/test_study.py
 
-.PHONY: help setup reports evidence search smoke test portable lock lab browser bench torture cluster publish notebooks clean
+.PHONY: help setup reports evidence search smoke test portable lock lab browser bench torture plants cluster publish notebooks clean
 
 help:  ## show this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-10s %s\n", $$1, $$2}'
@@ -83,6 +83,9 @@ bench: setup  ## measure speed against the machine's bound and other ways; write
 torture: setup  ## the slow tests; kill a run KILLS times, crowd notebooks, feed nonsense; writes reports/reference/reliability.md
 	$(BIN)/python -m pytest --numprocesses $(CORES) --dist loadfile -m torture
 	$(BIN)/python -m torture.torture --kills $(KILLS)
+
+plants: setup  ## judge what is learned from the records of eight plants on the plants themselves; an hour; writes reports/reference/plants.md
+	$(BIN)/python -m torture.plants --cores $(CORES)
 
 cluster: setup  ## as root on Debian: install SLURM, run the smoke scale through it, compare, stop it (ACCOUNTING=1: with a database)
 	$(BIN)/python -m pip install --quiet --constraint environment.txt --editable ".[slurm]"

@@ -1,6 +1,6 @@
 # The order of the stages for each case and seed. Every stage is one notebook, executed by helpers.runs.run.
 # Settings (snakemake --config name=value): seeds (how many), scale (smoke or paper), results, reports (folders),
-# evidence=1 for the runs beyond the paper's own (claims, limits, trials of offline learning, inferred settings), and
+# evidence=1 for the runs beyond the paper's own (notebooks 00 and 06 to 09, and trials of offline learning), and
 # missing=1 for a report of the seeds whose stages are all there.
 import shlex
 import sys

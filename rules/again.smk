@@ -19,19 +19,22 @@ def present(notebook, case, variant):
     return inputs(notebook, ROOT / "params", SCALE, case, variant, ROOT)
 
 
-def made_from(notebook, record):
-    """An input function: the file CHANGED where the result with this record was made from something else than there is now."""
+def made_from(notebook, record, case=None):
+    """An input function: the file CHANGED where the result with this record was made from something else than there is now.
+
+    `case`: whose parameters it reads, where no wildcard says so.
+    """
 
     def changed(wildcards):
         path = Path(record.format(**dict(wildcards.items())))
-        case, variant = getattr(wildcards, "case", None), getattr(wildcards, "variant", HEADLINE)
+        of_case, variant = getattr(wildcards, "case", case), getattr(wildcards, "variant", HEADLINE)
         try:
             before = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return []
         except ValueError:
             before = {}  # damaged: made again
-        if found := changes(before, present(notebook, int(case) if case else None, variant)):
+        if found := changes(before, present(notebook, int(of_case) if of_case else None, variant)):
             if not AGAIN:
                 Path(CHANGED).parent.mkdir(parents=True, exist_ok=True)  # the results may have been removed
                 Path(CHANGED).write_text(f"{time.time_ns()}\n", encoding="utf-8")

@@ -1,4 +1,5 @@
-# The runs beyond the paper's own: inferred settings, claims, limits and alternatives, one policy for all cases (notebooks 00, 08, 06 and 09).
+# The runs beyond the paper's own: inferred settings, claims, limits and alternatives, one policy for all cases, a plant of one's own
+# (notebooks 00, 08, 06, 09 and 07).
 def learned(wildcards):
     """The results of notebooks 01 to 04 for a case."""
     kinds = ("offline", "transfer", "online") if wildcards.case == "3" else ("offline", "online")
@@ -54,3 +55,15 @@ rule one_policy:
     priority: -1
     shell:
         run("09_one_policy", "seed")
+
+
+rule own_plant:
+    input:
+        made_from("07_your_own_process", record("own_process", f"{SEED}/case_1"), case=1),
+    output:
+        record("own_process", f"{SEED}/case_1"),
+    log:
+        f"{SEED}/notebooks/07_your_own_process.ipynb",
+    priority: -1
+    shell:
+        run("07_your_own_process", "seed", input_root=ROOT / "notebooks/plant")

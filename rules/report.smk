@@ -13,7 +13,7 @@ def read_of_seed(seed):
     if EVIDENCE:
         stages += ["inferred_settings"] if seed == 0 else []
         stages += [f"case_{case}/{stage}" for case in CASES for stage in ("experiments", *(["limits_safety"] if seed in FEW else []))]
-        stages += ["case_1/one_policy"] if seed in FEW else []
+        stages += ["case_1/one_policy", "case_1/own_process"] if seed in FEW else []
         for name, trial in TRIALS.items() if seed in FEW else ():
             stages += [f"case_{case}/{'transfer' if case == 3 else 'offline'}_{name}" for case in trial.cases]
     return stages

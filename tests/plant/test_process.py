@@ -113,10 +113,11 @@ def test_without_noise_the_step_converges_to_first_order(study):
 
 @pytest.mark.equation("4.1.3c")
 def test_the_disturbance_vanishes_at_the_steady_state_and_is_proportional_elsewhere(study):
-    process, noise = study().process, torch.full((1, 8), 3.0, dtype=F64)
-    rest = torch.zeros(1, 2, dtype=F64)
-    assert torch.equal(process.step(rest, rest, noise), rest)
-    np.testing.assert_allclose(process.disturbance(repeat(X0, 1))[0], np.diag(D) @ X0, rtol=1e-14)
+    process, kick = study(process={"integration_steps": 1}).process, torch.full((1, 2), 3.0, dtype=F64)
+    rest, x = torch.zeros(1, 2, dtype=F64), repeat(X0, 1)
+    assert torch.equal(process.step(rest, rest, kick), rest)
+    kicked = process.step(x, rest, kick) - process.step(x, rest, torch.zeros_like(kick))
+    np.testing.assert_allclose(kicked[0], 3 * np.sqrt(process.sampling_time) * np.diag(D) @ X0, rtol=1e-12)
 
 
 @pytest.mark.equation("4.1.3b")

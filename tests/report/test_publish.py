@@ -81,6 +81,7 @@ def project(monkeypatch, tmp_path):
         results / "paper/seed_0/case_1/notebooks/02_offline_irl_whole_return.ipynb": "02 of a trial",
         results / "paper/seed_0/case_3/notebooks/01_demonstrations.ipynb": "01",
         results / "paper/seed_0/case_3/notebooks/.01_demonstrations.123.ipynb": "what a killed run left",
+        results / "paper/seed_0/notebooks/07_your_own_process.ipynb": "07",
         results / "paper/seed_1/case_3/notebooks/01_demonstrations.ipynb": "01 of another seed",
         tmp_path / "README.md": README,
         tmp_path / "docs/running.md": RUNNING,
@@ -107,7 +108,7 @@ def test_publishing_copies_the_report_and_the_executed_notebooks_of_the_first_se
     assert found == {
         *(str(path.relative_to(project / "reports/latest")) for path in of_the_report),
         *("notebooks/02_offline_irl_case_1.ipynb", "notebooks/02_offline_irl_printed_case_1.ipynb"),
-        *("notebooks/01_demonstrations_case_3.ipynb", "reliability.md"),
+        *("notebooks/01_demonstrations_case_3.ipynb", "notebooks/07_your_own_process.ipynb", "reliability.md"),
     }
     assert (reference / "notebooks/01_demonstrations_case_3.ipynb").read_text() == "01"
     assert sorted(path.name for path in (project / "reports").iterdir()) == ["latest", "reference"]

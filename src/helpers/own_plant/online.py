@@ -50,6 +50,7 @@ class Improvement:
     Attributes:
         policy: the one to go on with. taken: whether it is the new one.
         before, after: mean |e| of the old and the new policy on fresh episodes, as shares of the record's PID's.
+        worse: share of the exploring episodes that were worse than those of the record's PID.
         words: all of it in a sentence.
     """
 
@@ -57,6 +58,7 @@ class Improvement:
     taken: bool
     before: float
     after: float
+    worse: float
     words: str
 
 
@@ -107,7 +109,7 @@ def improve_on_plant(workshop: Workshop, identified: Identified, policy: Trackin
         f"record's PID; the policy learned after them {'takes over' if taken else 'does not take over'} ({100 * since:.0f} against "
         f"{100 * old:.0f} % of the record's PID's mean |e| in a paired test, p = {p_value:.2g})"
     )
-    return Improvement(new if taken else policy, taken, old, since, words)
+    return Improvement(new if taken else policy, taken, old, since, worse, words)
 
 
 def at_set_points(workshop: Workshop, process: Process, candidates: Mapping[str, Tracker], n_repeats: int) -> pd.DataFrame:

@@ -75,10 +75,6 @@ class LinearProcess:
         """h(x, u) of Eq. 4.1.3b, shape (K, n_x), per unit of time."""
         return _product(self.drift_state, x) + _product(self.drift_input, u)
 
-    def disturbance(self, x: Tensor) -> Tensor:
-        """delta(x) of Eq. 4.1.3c, shape (K, n_x), per square root of time: it vanishes at the steady state."""
-        return self.disturbance_gain * x
-
     def step(self, x: Tensor, u: Tensor, noise: Tensor) -> Tensor:
         """The state one sample later by Euler-Maruyama, Eq. 4.1.3a.
 

@@ -130,10 +130,8 @@ def executed_copies(first: Path) -> dict[str, Path]:
         for path in sorted(first.glob("case_*/notebooks/[!.]*.ipynb"))
         if not (found := LEARNT.fullmatch(path.stem)) or found[1] in VARIANTS
     }
-    copies["05_report.ipynb"] = LATEST / "notebooks/05_report.ipynb"
-    if (first / "inferred_settings").is_dir():
-        copies["00_inferred_settings.ipynb"] = first / "notebooks/00_inferred_settings.ipynb"
-    return copies
+    of_no_case = [LATEST / "notebooks/05_report.ipynb", *sorted((first / "notebooks").glob("[!.]*.ipynb"))]
+    return copies | {path.name: path for path in of_no_case}
 
 
 def relinked(text: str) -> str:
@@ -172,7 +170,14 @@ def publish() -> None:
         target.write_text(relinked(target.read_text(encoding="utf-8")), encoding="utf-8")
     if (first / "inferred_settings").is_dir():
         _copy(first / "inferred_settings", partial / "inferred_settings")
-    for part in ("benchmarks", "inferred_settings", "reliability.md", "search"):  # runs of their own, which stay
+    for part in (
+        "benchmarks",
+        "inferred_settings",
+        "plants.csv",
+        "plants.md",
+        "reliability.md",
+        "search",
+    ):  # runs of their own, which stay
         if (REFERENCE / part).exists() and not (partial / part).exists():
             _copy(REFERENCE / part, partial / part)
     if REFERENCE.exists():

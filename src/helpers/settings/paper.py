@@ -180,29 +180,20 @@ class VariantParams(Record):
 class TrialParams(Record):
     """params/trials.yaml: a trial of offline learning, as the changes that it makes to a variant.
 
-    `learner`, `weights` and `exploration` hold the changed leaves as the file has them; `cases` is where `make evidence` runs it.
+    `learner` and `weights` hold the changed leaves as the file has them; `cases` is where `make evidence` runs it.
     """
 
     cases: Annotated[tuple[Count, ...], Field(min_length=1)] = (1, 3)
     base: Text
     title: Text
-    family: Literal[
-        "step size",
-        "weights",
-        "kept policy",
-        "entropy",
-        "clipped ratio",
-        "exploration",
-        "credit",
-    ]
+    family: Literal["step size", "weights", "kept policy", "entropy", "clipped ratio", "credit"]
     learner: dict[str, Any] = Field(default_factory=dict)
     weights: dict[str, Any] = Field(default_factory=dict)
-    exploration: dict[str, Any] = Field(default_factory=dict)
 
     @property
     def changes(self) -> dict[str, dict[str, Any]]:
         """The changed leaves by part of a variant."""
-        return {name: part for name in ("learner", "weights", "exploration") if (part := getattr(self, name))}
+        return {name: part for name in ("learner", "weights") if (part := getattr(self, name))}
 
 
 class OnlineLearningParams(Record):

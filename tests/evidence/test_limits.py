@@ -38,7 +38,6 @@ def learned(contest):
 
 def test_the_grids_say_whether_they_agree(contest, attained):
     _, grids = attained
-    assert sorted(grids["beta"].unique()) == [10.0, 30.0]
     for row in grids.to_dict("records"):
         close = abs(row["difference"]) <= 0.005 and abs(row["change"]) <= 0.005
         least = row["minimum_variance_x"] * (1 - contest.limits.attainable.tolerance)
@@ -131,19 +130,19 @@ def test_a_library_that_is_missing_is_one_sentence(contest, monkeypatch):
 
 
 def test_gaps_are_to_the_programme_on_the_same_draws(contest, attained, learned):
-    optima, _ = attained
-    table = limits.gaps(contest, optima, learned).set_index(["beta", "controller"])
-    best = table.loc[(30.0, "dynamic_programme")]
+    optimum, _ = attained
+    table = limits.gaps(contest, optimum, learned).set_index("controller")
+    best = table.loc["dynamic_programme"]
     assert (best["gap"], best["gap_low"], best["gap_high"]) == (0.0, 0.0, 0.0)
     exact = limits.without_noise(contest.session)
-    expected = objective(exact.fresh(Tabulated(optima[30.0]), contest.scale.draws), exact.features.on("x"), 30.0).mean()
+    expected = objective(exact.fresh(Tabulated(optimum), contest.scale.draws), exact.features.on("x"), 30.0).mean()
     assert best["objective"] == pytest.approx(expected.item())
     for _, row in table.iterrows():
         assert row["gap_low"] <= row["gap"] <= row["gap_high"]
-    share = table.loc[(30.0, "mpc"), "objective"] / best["objective"]
-    assert table.loc[(30.0, "mpc"), "gap"] == pytest.approx(100 * (1 - share))
+    share = table.loc["mpc", "objective"] / best["objective"]
+    assert table.loc["mpc", "gap"] == pytest.approx(100 * (1 - share))
     budget = equal_budget.at_budgets(equal_budget.curves(learned), contest)
-    assert "below the programme" in limits_answer.answer(table.loc[contest.beta], budget)
+    assert "below the programme" in limits_answer.answer(table, budget)
 
 
 def test_the_interval_of_a_gap_covers_as_it_should():
@@ -158,7 +157,7 @@ def test_the_interval_of_a_gap_covers_as_it_should():
 
 
 def test_the_scorecard_holds_every_figure_of_every_controller(contest, attained):
-    optimum = attained[0][30.0]
+    optimum = attained[0]
     builds, still = (limits.of_the_paper(contest) | limits.known_process(contest, optimum, flag) for flag in (False, True))
     table = limits.control_quality(contest, builds, still).set_index(["controller", "figure"])["value"]
     figures = {name for controller, name in table.index if controller == "expert"}
@@ -219,9 +218,7 @@ def test_figures_show_the_tables(contest):
     curves = pd.DataFrame({"learner": ["ppo", "ppo"], "episodes": [0, 10], "objective": [1.0, 2.0]})
     (axes,) = budget_curves(curves, {"mpc": 3.0}).axes
     assert [line.get_ydata()[-1] for line in axes.lines] == [2.0, 3.0]
-    gaps = pd.DataFrame(
-        {"beta": [30.0, 30.0], "controller": ["expert", "mpc"], "gap": [20.0, 5.0], "gap_low": 1.0, "gap_high": 21.0}
-    )
+    gaps = pd.DataFrame({"case": 1, "controller": ["expert", "mpc"], "gap": [20.0, 5.0], "gap_low": 1.0, "gap_high": 21.0})
     (axes,) = gap_figure(gaps).axes
     assert axes.lines[0].get_xdata().tolist() == [5.0, 20.0]  # the first controller on top
     robust = robustness.robustness(contest, {"expert": lambda run: run.expert, "mpc": lambda run: run.minimum_variance})

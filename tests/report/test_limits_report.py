@@ -31,10 +31,10 @@ def write(folder, level):
     """What notebook 06 writes, in small: the gap of the MPC and every other number follow from `level`."""
     objectives = {"expert": 10.0, "mpc": 19.0, "irl_reinforce": level, "dynamic_programme": 20.0, "minimum_variance": 18.0}
     objectives |= {"minimum_variance_filtered": 18.5, "minimum_variance_x": 19.8, "dynamic_programme_filtered": 19.0}
-    gaps = pd.DataFrame({"beta": 30.0, "controller": list(objectives), "objective": list(objectives.values())})
+    gaps = pd.DataFrame({"controller": list(objectives), "objective": list(objectives.values())})
     below = gaps["controller"].map({"mpc": level, "irl_reinforce": 8.0}).fillna(100 * (1 - gaps["objective"] / 20))
     gaps = gaps.assign(gap=below, gap_low=below - 1, gap_high=below + 1, low=gaps["objective"] - 0.1, high=gaps["objective"] + 0.1)
-    grids = pd.DataFrame({"beta": 30.0, "states": [41, 61], "difference": [0.02, -level / 1e4]})
+    grids = pd.DataFrame({"states": [41, 61], "difference": [0.02, -level / 1e4]})
     save_stage(folder / "limits_attainable", {}, {"gaps.csv": gaps, "grids.csv": grids})
     rows = [("mpc", 0, 19.0), ("ppo", 0, 1.0), ("ppo", 500, level), ("pid_tuned", 0, 10.0), ("pid_tuned", 400, level / 2)]
     curves = pd.DataFrame(rows, columns=["learner", "episodes", "objective"])
@@ -79,7 +79,7 @@ def test_one_seed_shows_its_monte_carlo_interval(results):
     assert response.loc[("I", "offset-free MPC"), list(numbers)].to_dict() == numbers
     assert response.loc[("I", "PPO from scratch"), "Overshoot, $C_A^*$ (%)"] == "–"  # it never rises
     assert found["limits_inputs"]["Harris index, $T^*$"].tolist() == ["0.90", "0.90"]
-    known = found["limits_attainable"].set_index(["case", "controller"])["$J$, $\\beta$ = 30"]
+    known = found["limits_attainable"].set_index(["case", "controller"])["$J$"]
     assert len(known) == 10
     assert known["II", "minimum variance on y"] == "18.00 [17.90, 18.10]"
     assert found["limits_safety"].set_index(["case", "controller"]).loc[("I", "hot start"), "Worst episode ($J$)"] == "10.0"

@@ -128,10 +128,9 @@ def test_publishing_writes_the_numbers_into_readme(project):
     assert kept == README.replace("old\n", "").splitlines()
 
 
-def test_the_gaps_to_the_optimum_of_the_sharpest_objective_are_written_where_they_were_run(project):
-    columns = 'controller,"I, $\\beta$ = 10","I, $\\beta$ = 30","III, $\\beta$ = 10","III, $\\beta$ = 30"'
-    rows = ["PID (demonstrator),1.0,2.0,3.0,4.5", 'offset-free MPC,5.0,"6.0 [5.0, 7.0]",7.0,8.0', "programme on x,0.0,0.0,0.0,0.0"]
-    (project / "reports/latest/tables/limits_gaps.csv").write_text("\n".join([columns, *rows, ""]))
+def test_the_gaps_to_the_optimum_are_written_where_they_were_run(project):
+    rows = ["controller,I,III", "PID (demonstrator),2.0,4.5", 'offset-free MPC,"6.0 [5.0, 7.0]",8.0', "programme on x,0.0,0.0"]
+    (project / "reports/latest/tables/limits_gaps.csv").write_text("\n".join([*rows, ""]))
     assert publish.main([]) == 0
     lines = (project / "README.md").read_text(encoding="utf-8").splitlines()
     first = lines.index("<!-- limits: c -->") + 1

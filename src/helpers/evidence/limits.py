@@ -39,15 +39,15 @@ def without_noise(session: Study) -> Study:
 # The attainable ------------------------------------------------------------------------------------------------------
 
 
-def attain(contest: Contest, beta: float) -> tuple[Optimum, pd.DataFrame]:
-    """The dynamic programme for one beta, on finer and finer grids until value and Monte Carlo agree, and what each grid gave.
+def attainable(contest: Contest) -> tuple[Optimum, pd.DataFrame]:
+    """The dynamic programme, on finer and finer grids until value and Monte Carlo agree, and what each grid gave.
 
     It stops where, within the tolerance, the value averaged over initial states and the Monte Carlo value of the greedy policy from
     the same states agree, neither lies below one-step minimum variance on x, and the grid before gave the same. agrees: whether
     that was reached.
     """
     params, scale, session = contest.limits.attainable, contest.scale, without_noise(contest.session)
-    features = session.features.on("x")
+    features, beta = session.features.on("x"), contest.beta
     reference = session.fresh(session.minimum_variance, scale.draws)
     least = objective(reference, features, beta).double().mean().item()
     rows: list[dict[str, float]] = []
@@ -63,17 +63,11 @@ def attain(contest: Contest, beta: float) -> tuple[Optimum, pd.DataFrame]:
         agrees = (
             abs(gap) <= params.tolerance and min(value, found) >= least * (1 - params.tolerance) and abs(change) <= params.tolerance
         )
-        row = {"beta": beta, "states": states, "inputs": inputs, "value": value, "monte_carlo": found, "standard_error": error}
+        row = {"states": states, "inputs": inputs, "value": value, "monte_carlo": found, "standard_error": error}
         rows.append(row | {"difference": gap, "change": change, "minimum_variance_x": least, "agrees": float(agrees)})
         if agrees:
             break
     return optimum, pd.DataFrame(rows)
-
-
-def attainable(contest: Contest) -> tuple[dict[float, Optimum], pd.DataFrame]:
-    """`attain` for every beta."""
-    found = {beta: attain(contest, beta) for beta in contest.limits.attainable.betas}
-    return {beta: optimum for beta, (optimum, _) in found.items()}, pd.concat([rows for _, rows in found.values()])
 
 
 def known_process(contest: Contest, optimum: Optimum | None = None, stationary: bool = False) -> dict[str, Build]:
@@ -111,24 +105,19 @@ def through_the_model(contest: Contest) -> Learned:
     return as_it_is(contest, partial(Study.deploy, policy=one_policy.stored(contest.session)))
 
 
-def gaps(contest: Contest, optima: Mapping[float, Optimum], learned: Mapping[str, Learned]) -> pd.DataFrame:
+def gaps(contest: Contest, optimum: Optimum, learned: Mapping[str, Learned]) -> pd.DataFrame:
     """Every controller's objective on x and its gap to the programme's greedy policy, on the same disturbances.
 
-    Columns: beta, controller, objective with its 95 % interval (low, high), gap in per cent with its own (gap_low, gap_high), by
-    the delta method on paired trajectories. The learners had the real objective's beta; at another they are only judged.
+    Columns: controller, objective with its 95 % interval (low, high), gap in per cent with its own (gap_low, gap_high), by the
+    delta method on paired trajectories.
     """
-    shared = of_the_paper(contest) | {name: result.build for name, result in learned.items()} | known_process(contest)
-    batches = {name: _full(contest, name, build) for name, build in shared.items()}
-    features, rows = contest.session.features.on("x"), []
-    for beta, optimum in optima.items():
-        own = {name: build for name, build in known_process(contest, optimum).items() if name not in shared}
-        every = batches | {name: _full(contest, name, build) for name, build in own.items()}
-        returns = {name: objective(batch, features, beta).double() for name, batch in every.items()}
-        best = returns["dynamic_programme"]
-        for name, values in returns.items():
-            mean, reach = values.mean().item(), NORMAL * values.std().item() / len(values) ** 0.5
-            interval = {"objective": mean, "low": mean - reach, "high": mean + reach}
-            rows.append({"beta": beta, "controller": name, **interval, **_gap(values, best)})
+    builds = of_the_paper(contest) | {name: result.build for name, result in learned.items()} | known_process(contest, optimum)
+    returns = {name: contest.returns(_full(contest, name, build)) for name, build in builds.items()}
+    best, rows = returns["dynamic_programme"], []
+    for name, values in returns.items():
+        mean, reach = values.mean().item(), NORMAL * values.std().item() / len(values) ** 0.5
+        interval = {"objective": mean, "low": mean - reach, "high": mean + reach}
+        rows.append({"controller": name, **interval, **_gap(values, best)})
     return pd.DataFrame(rows)
 
 

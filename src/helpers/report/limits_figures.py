@@ -57,25 +57,23 @@ GRIDS = {  # of each group of conditions: title, label of the rows, label of the
 }
 
 
-def gap_figure(gaps: pd.DataFrame, panel: str = "beta") -> Figure:
-    """The gap of every controller to the dynamic programme with its 95 % interval; a panel for each beta or case.
+def gap_figure(gaps: pd.DataFrame) -> Figure:
+    """The gap of every controller to the dynamic programme with its 95 % interval; a panel for each case.
 
     Args:
-        gaps: columns beta or case, controller, gap, gap_low, gap_high, in per cent.
-        panel: the column that tells the panels apart.
+        gaps: columns case, controller, gap, gap_low, gap_high, in per cent.
     """
     listed = [name for name in LABELS if name in set(gaps["controller"])][::-1]
     figure = empty_figure(WIDTH, 0.6 + 0.27 * len(listed))
-    panels = np.atleast_1d(figure.subplots(1, gaps[panel].nunique(), sharey=True))
-    for letter, (value, rows), axes in zip(ascii_uppercase, gaps.groupby(panel), panels, strict=False):
+    panels = np.atleast_1d(figure.subplots(1, gaps["case"].nunique(), sharey=True))
+    for letter, (case, rows), axes in zip(ascii_uppercase, gaps.groupby("case"), panels, strict=False):
         found = rows.set_index("controller").reindex(listed)
         reach = np.stack([found["gap"] - found["gap_low"], found["gap_high"] - found["gap"]])
         axes.errorbar(found["gap"], range(len(found)), xerr=reach, fmt="o", color=INK, markersize=4, label="gap and 95 % interval")
         axes.axvline(0, color=MUTED, linewidth=1)
         axes.set_yticks(range(len(found)), [LABELS[name] for name in listed])
         axes.set_xlabel("gap to the programme (%)")
-        title = f"$\\beta = {value:g}$" if panel == "beta" else case_study(value)
-        head(axes, letter, title, f"{letter} {panel} {value:g}")
+        head(axes, letter, case_study(case), f"{letter} case {case}")
     return figure
 
 

@@ -32,7 +32,9 @@ def attainable(results: Results) -> dict[int, dict[str, float]]:
     look_ahead: what it gains over one-step control; noise: what it loses behind a filter; filter: what filtering gives one-step
     control on y.
     """
-    gaps = limits_report.sharp_gaps(results).pivot_table(index="case", columns="controller", values="gap", aggfunc="median")
+    gaps = limits_report.read(results, "attainable", "gaps.csv").pivot_table(
+        index="case", columns="controller", values="gap", aggfunc="median"
+    )
     return {
         int(case): {
             "look_ahead": row["minimum_variance_x"],
@@ -45,7 +47,7 @@ def attainable(results: Results) -> dict[int, dict[str, float]]:
 
 def agreement(results: Results) -> float:
     """The largest difference between the programme's value and that of its policy by Monte Carlo, in per cent."""
-    grids = limits_report.read(results, "attainable", "grids.csv").drop_duplicates(["case", "seed", "beta"], keep="last")
+    grids = limits_report.read(results, "attainable", "grids.csv").drop_duplicates(["case", "seed"], keep="last")
     return 100 * float(grids["difference"].abs().max())
 
 
@@ -80,7 +82,7 @@ def practice(results: Results) -> dict[str, Any]:
     """
     listed = limits_report.listed_budgets(results).astype({"metric": int})
     medians = listed.groupby(["case", "metric", "learner"])["value"].median()
-    reached = limits_report.sharp_gaps(results).groupby(["case", "controller"])["objective"].median()
+    reached = limits_report.read(results, "attainable", "gaps.csv").groupby(["case", "controller"])["objective"].median()
     model_ahead: list[int] = []
     without_model: dict[int, dict[str, list[int]]] = {}
     for (case, budget), row in medians.unstack("learner").iterrows():

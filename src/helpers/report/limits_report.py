@@ -109,12 +109,6 @@ def without_the_plant(results: Results) -> dict[str, pd.DataFrame]:
     return found
 
 
-def sharp_gaps(results: Results) -> pd.DataFrame:
-    """The gaps under the headline beta of their case."""
-    gaps = read(results, "attainable", "gaps.csv")
-    return gaps[gaps["beta"] == gaps["case"].map(lambda case: results.params[case].case.online.headline_beta)]
-
-
 def plant_names(states: Iterable[float], inputs: Iterable[float]) -> list[str]:
     """Plants that are not the model, by their factors of A and B."""
     return [f"A x {state:g}, B x {entry:g}" for state, entry in zip(states, inputs, strict=True)]
@@ -171,34 +165,32 @@ def summary(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _gaps(gaps: pd.DataFrame) -> pd.DataFrame:
-    """A row for each controller, a column for each case and beta: the gap to the programme in per cent."""
+    """A row for each controller, a column for each case: the gap to the programme in per cent."""
     columns: dict[str, dict[str, str]] = {}
-    for (case, beta), rows in _with_interval(gaps, "gap", ("gap_low", "gap_high")).groupby(["case", "beta"]):
+    for case, rows in _with_interval(gaps, "gap", ("gap_low", "gap_high")).groupby("case"):
         found = rows.set_index("controller")
-        columns[f"{ROMAN[case - 1]}, $\\beta$ = {beta:g}"] = {name: spread(row, decimals=1) for name, row in found.iterrows()}
+        columns[ROMAN[case - 1]] = {name: spread(row, decimals=1) for name, row in found.iterrows()}
     table = pd.DataFrame(columns)
     table = table.reindex([name for name in LABELS if name in table.index])
     return table.rename(index=LABELS).rename_axis("controller").reset_index()
 
 
 def _attainable(gaps: pd.DataFrame) -> pd.DataFrame:
-    """The objective of the controllers that know the process: a row for each case and controller, a column for each beta."""
+    """The objective of the controllers that know the process: a row for each case and controller."""
     known = [name for name in LABELS if name.startswith(("minimum_variance", "dynamic_programme"))]
-    found = _with_interval(gaps, "objective", ("low", "high")).sort_values("beta")
-    rows = []
-    for case, name in product(sorted(gaps["case"].unique()), known):
-        of_both = found[(found["case"] == case) & (found["controller"] == name)]
-        cells = {f"$J$, $\\beta$ = {row['beta']:g}": spread(row, decimals=2) for _, row in of_both.iterrows()}
-        rows.append({"case": ROMAN[case - 1], "controller": LABELS[name]} | cells)
+    found = _with_interval(gaps, "objective", ("low", "high")).set_index(["case", "controller"])
+    rows = [
+        {"case": ROMAN[case - 1], "controller": LABELS[name], "$J$": spread(found.loc[(case, name)], decimals=2)}
+        for case, name in product(sorted(gaps["case"].unique()), known)
+    ]
     return pd.DataFrame(rows)
 
 
 def _with_interval(gaps: pd.DataFrame, name: str, ends: tuple[str, str]) -> pd.DataFrame:
-    """Columns case, beta, controller, median, ci_low, ci_high of one quantity; of a single seed that of its Monte Carlo."""
+    """Columns case, controller, median, ci_low, ci_high of one quantity; of a single seed that of its Monte Carlo."""
     if len(set(gaps["seed"])) == 1:
         return gaps.rename(columns={name: "median", ends[0]: "ci_low", ends[1]: "ci_high"})
-    found = [summary(rows.assign(metric=name, value=rows[name])).assign(beta=beta) for beta, rows in gaps.groupby("beta")]
-    return pd.concat(found, ignore_index=True).rename(columns={"stage": "controller"})
+    return summary(gaps.assign(metric=name, value=gaps[name])).rename(columns={"stage": "controller"})
 
 
 def _budget(listed: pd.DataFrame) -> pd.DataFrame:
@@ -279,15 +271,15 @@ def _quality(quality: pd.DataFrame, figures: Mapping[str, tuple[str, int, int]])
 
 def draw(results: Results) -> dict[str, Figure]:
     """The figures of the section by name, where notebook 06 was run: all cases in one, and a heat map for each grid and case."""
-    if read(results, "attainable", "gaps.csv").empty:
+    gaps = read(results, "attainable", "gaps.csv")
+    if gaps.empty:
         return {}
-    sharp = sharp_gaps(results)
-    levels = {int(case): rows.groupby("controller")["objective"].median() for case, rows in sharp.groupby("case")}
-    shown = _with_interval(sharp, "gap", ("gap_low", "gap_high"))
+    levels = {int(case): rows.groupby("controller")["objective"].median() for case, rows in gaps.groupby("case")}
+    shown = _with_interval(gaps, "gap", ("gap_low", "gap_high"))
     shown = shown.rename(columns={"median": "gap", "ci_low": "gap_low", "ci_high": "gap_high"})
     drawn = {
         "limits_budget": limits_figures.budget_by_case(read(results, "budget", "curves.csv"), levels),
-        "limits_gaps": limits_figures.gap_figure(shown, "case"),
+        "limits_gaps": limits_figures.gap_figure(shown),
         "limits_robustness": limits_figures.robustness_figure(worst(results), GROUPS),
     }
     robust, place = read(results, "robustness", "robustness.csv"), ["group", "row", "column", "controller"]

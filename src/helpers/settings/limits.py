@@ -26,7 +26,6 @@ Several = Field(min_length=1)
 class AttainableParams(Record):
     """The dynamic programme."""
 
-    betas: Annotated[tuple[Positive, ...], Several, Leaf("-")]
     margin: Annotated[NotNegative, Leaf("share of the range")]
     nodes: Annotated[Count, Leaf("nodes")]
     tolerance: Annotated[Positive, Leaf("-")]

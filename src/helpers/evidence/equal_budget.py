@@ -30,6 +30,9 @@ from helpers.settings.limits import LimitsParams, LimitsScaleParams
 
 Build = Callable[[Study], Controller]  # the same controller, told of the set point of that session
 CURVE = ("learner", "episodes", "objective", "standard_error")
+# Of the last step size, under a reward of which the policy is the optimum already: with all of it, and as many steps a batch as under
+# the real objective, J fell from 17.6 to 2.7 in five epochs (Case I, seed 0); with this one step it stays at 17.6.
+GENTLE = 0.1
 
 
 class PackageError(InputError):
@@ -132,7 +135,8 @@ def reinforced(
         policy, contest.batch, n_epochs, session.stream("limits", purpose), from_scratch=from_scratch or alone
     )
     usual = learner.params.model_copy(update={"critic": 0.0}) if alone else learner.params
-    gentle = usual.model_copy(update={"learning_rate_start": usual.learning_rate_end})  # where a policy begins at its optimum
+    rates = dict.fromkeys(("learning_rate_start", "learning_rate_end"), GENTLE * usual.learning_rate_end)
+    gentle = usual.model_copy(update=rates | {"passes": 1, "minibatches": 1})
 
     def train() -> State:
         visitor(0, learner.average)

@@ -68,6 +68,8 @@ def inputs(
         values = dict(_values(read_yaml(params_root / f"{name}.yaml")))
         if notebook not in OF_ALL_CASES:
             values = _read_by(notebook, name, values, params_root, scale, case, variant)
+        elif notebook != REPORT and name.startswith("case_"):  # what learns there is of no variant
+            values = {key: value for key, value in values.items() if not key.startswith("variants.")}
         found[f"params/{name}.yaml"] = digest(values)
     return found
 

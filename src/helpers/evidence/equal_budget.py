@@ -4,6 +4,7 @@ Every learner gives a curve (the objective of its mode against the plant episode
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -19,6 +20,7 @@ from helpers.evidence.mpc import OffsetFreeMPC
 from helpers.evidence.scheduled_pid import ScheduledPID
 from helpers.learning.algorithm_1 import Reward, algorithm_1
 from helpers.learning.evaluation import objective
+from helpers.learning.learner import TrainingError
 from helpers.learning.policy import LSTMPolicy, log_density
 from helpers.plant.controllers import Controller
 from helpers.plant.rollout import rollout
@@ -123,7 +125,7 @@ def reinforced(
     alone: bool = False,
     early_reward: Reward | None = None,
 ) -> Learned:
-    """Algorithm 1 on the real objective with the online settings of learning.yaml, from a given policy.
+    """Algorithm 1 on the real objective with the online settings of learning.yaml, from a given policy; its curve may end early.
 
     Args:
         from_scratch: it explores further, and begins with the smaller beta of `dense`. alone: REINFORCE without a critic, which
@@ -140,15 +142,16 @@ def reinforced(
 
     def train() -> State:
         visitor(0, learner.average)
-        while learner.epochs < n_epochs:
-            if early_reward and contest.early(learner.episodes):
-                learner.params = gentle
-                algorithm_1(learner, early_reward, 1)
-            else:
-                learner.params = usual
-                algorithm_1(learner, learner.tracking(contest.sharpness(learner.episodes, from_scratch)), 1)
-            if visitor.due(learner.episodes):
-                visitor(learner.episodes, learner.average)
+        with suppress(TrainingError):  # nothing to learn from: the policy stays as it is
+            while learner.epochs < n_epochs:
+                if early_reward and contest.early(learner.episodes):
+                    learner.params = gentle
+                    algorithm_1(learner, early_reward, 1)
+                else:
+                    learner.params = usual
+                    algorithm_1(learner, learner.tracking(contest.sharpness(learner.episodes, from_scratch)), 1)
+                if visitor.due(learner.episodes):
+                    visitor(learner.episodes, learner.average)
         return {"policy": learner.average.state_dict(), "curve": visitor.curve}
 
     kept = session.trained(train, learner, purpose)

@@ -38,7 +38,6 @@ class Claim(Record):
     """One checkable sentence of the paper, and what decides about it.
 
     Attributes:
-        one_sided: failing tells nothing, because it may be one of our settings.
         changed: when and why the test was changed after results were known.
     """
 
@@ -47,7 +46,6 @@ class Claim(Record):
     cases: Annotated[tuple[Count, ...], Field(min_length=1)]
     test: Annotated[str, StringConstraints(strict=True, pattern=TESTS)]
     margin: Real | None = None
-    one_sided: bool = False
     why: Text
     quantities: dict[Text, Quantity] = Field(default_factory=dict)
     changed: Dated | None = None
@@ -125,9 +123,7 @@ def judge(claim: Claim, values: pd.DataFrame) -> Verdict:
         verdict, reason = HOLDS, f"the whole interval lies {side} {claim.margin:g}"
     elif ahead[1] <= 0:
         tie = kind != "value" and low == high == claim.margin
-        verdict = OPEN if claim.one_sided else FAILS
-        reason = "a tie" if tie else f"no part of the interval lies {side} {claim.margin:g}"
-        reason += ", with settings of ours" * claim.one_sided
+        verdict, reason = FAILS, "a tie" if tie else f"no part of the interval lies {side} {claim.margin:g}"
     else:
         verdict, reason = OPEN, f"the interval holds {claim.margin:g}"
     return Verdict(verdict, reason, len(found), float(np.median(found)), low, high)

@@ -282,7 +282,7 @@ def predictions(study: Fitting, gains: Mapping[str, Fit]) -> pd.DataFrame:
     for name, best in gains.items():
         cases = list(study.cases(name))
         tables = " and ".join(str(session.published[case].table) for case in cases)
-        sources += [(f"Table {tables}", cases, best.settings), ("parameter files", cases, {})]
+        sources += [(f"Table{'s' * (len(cases) > 1)} {tables}", cases, best.settings), ("parameter files", cases, {})]
         if len(cases) > 1:
             problem = study.problem(name)
             for case in cases:

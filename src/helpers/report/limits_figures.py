@@ -34,7 +34,7 @@ LABELS = {
     "pid_scheduled": "PID, gains scheduled",
     "one_policy": "one policy, through the model",
     "one_policy_robust": "the same, robust",
-    "one_policy_constrained": "the same, calm",
+    "one_policy_constrained": "the same, constrained",
     "mpc": "offset-free MPC",
     "minimum_variance": "minimum variance on y",
     "minimum_variance_filtered": "minimum variance, filtered y",
@@ -52,7 +52,7 @@ NOTHING = "#c8c8c8"  # under a condition in which no controller earns anything
 GRIDS = {  # of each group of conditions: title, label of the rows, label of the columns
     "model": ("mismatch of the model", "A, times", "B, times"),
     "noise": ("disturbance and observation noise", "disturbance, times", "observation noise, times"),
-    "set_point": ("set points not trained on", "set point of the first loop, times", "of the other, times"),
+    "set_point": ("other set points", "set point of the first loop, times", "set point of the second loop, times"),
     "time": ("dead time and load", "dead time, samples", "load, share of the change"),
 }
 
@@ -113,10 +113,11 @@ def budget_by_case(curves: pd.DataFrame, levels: Mapping[int, Mapping[str, float
 
 def _draw_budget(axes: Axes, curves: pd.DataFrame, levels: Mapping[str, float]) -> None:
     names = [name for name in LEARNERS if name in set(curves["learner"])]
-    for name, colour, marker in zip(names, cycle(LOOP_COLOURS), cycle("osv^D*PXh"), strict=False):
+    for index, (name, colour, marker) in enumerate(zip(names, cycle(LOOP_COLOURS), "osv^D*PXh", strict=False)):
         spent = curves[curves["learner"] == name].groupby("episodes")["objective"]
         low, line, high = (spent.quantile(share) for share in (0.25, 0.5, 0.75))
-        axes.plot(line.index, line, label=LABELS[name], markersize=4, color=colour, marker=marker)
+        dash = KIND_STYLES[index // len(LOOP_COLOURS)]
+        axes.plot(line.index, line, label=LABELS[name], markersize=4, color=colour, marker=marker, linestyle=dash)
         if (high > low).any():
             axes.fill_between(line.index, low, high, color=colour, alpha=0.15, linewidth=0)
     for name, dash in zip([name for name in LEVELS if name in levels], DASHES, strict=False):

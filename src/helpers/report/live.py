@@ -11,8 +11,10 @@ from helpers.plant.controllers import Controller
 from helpers.plant.task import Trajectories
 from helpers.report.figures import BAND, BAND_OPACITY, LOOP_COLOURS, SET_POINT, TIME_LABEL, WIDTH, empty_figure, symbol
 from helpers.runs.study import Study
+from helpers.settings.leaf import DEVIATION
 
 N_TRAJECTORIES = 200
+CONTROLLERS = LOOP_COLOURS[:1] + LOOP_COLOURS[2:]  # without that of the set point
 
 
 def elsewhere(study: Study, set_point: Sequence[float], disturbance: float = 1.0, noise: float = 1.0) -> Study:
@@ -49,7 +51,7 @@ def side_by_side(study: Study, policies: Mapping[str, LSTMPolicy]) -> Figure:
     grid = figure.subplots(2, max(len(process.controlled), len(process.manipulated)), squeeze=False, sharex=True)
     for row, (names, kind) in zip(grid, ((process.controlled, "x"), (process.manipulated, "u")), strict=True):
         for loop, (axes, name) in enumerate(zip(row, names, strict=False)):
-            for colour, label, batch in zip(LOOP_COLOURS, labels, found.values(), strict=False):
+            for colour, label, batch in zip(CONTROLLERS, labels, found.values(), strict=False):
                 signal = getattr(batch, kind)[..., loop].double()
                 low, mean, high = (signal.mean(1) + side * signal.std(1) for side in (-1, 0, 1))
                 axes.fill_between(range(len(mean)), low, high, color=colour, alpha=BAND_OPACITY, linewidth=0, label=BAND)
@@ -57,6 +59,7 @@ def side_by_side(study: Study, policies: Mapping[str, LSTMPolicy]) -> Figure:
             if kind == "x":
                 axes.axhline(study.params.case.set_point[loop], color=SET_POINT, linestyle=":", label="set point")
             axes.set_title(symbol(name), loc="left")
+            axes.set_ylabel(DEVIATION.replace(", ", ",\n"))
             axes.set_label(name)
     lines = grid[0, 0].lines
     figure.supxlabel(TIME_LABEL)

@@ -17,7 +17,7 @@ from statsmodels.tsa.stattools import acf
 
 from helpers.learning.model_gradient import GradientRecord
 from helpers.own_plant.description import PlantDescription, Variable
-from helpers.own_plant.gate import POLICY, RECORD, SIMPLEST, Verdict
+from helpers.own_plant.gate import POLICY, RECORD, SIMPLEST, TUNED, Verdict
 from helpers.own_plant.identify import Validation
 from helpers.own_plant.learn import Workshop
 from helpers.own_plant.quality import CleanRecords
@@ -31,9 +31,9 @@ MODE_SHADES = {"manual": SHADES["not in automatic"], "hold": SHADES["left out"],
 CANDIDATES = ("#6e6e6e", LOOP_COLOURS[4], LOOP_COLOURS[2], LOOP_COLOURS[0])  # in the order of `gate.SIMPLEST`
 SHARES = {"mean |e|": "mean |e|, share of the record's PID's", "movement": "movement, share of the record's PID's"}
 CURVES = {
-    "cost": "mean |e|, share of the record's PID's",
-    "movement": "movement, share of what is allowed",
-    "price": "price on movement",
+    "cost": "cost (no unit)",
+    "movement": "movement (share of what is allowed)",
+    "price": "price on movement (no unit)",
 }
 MOST_POINTS = 4000  # of a line: more cannot be told apart on a page
 
@@ -74,7 +74,8 @@ def loops_figure(workshop: Workshop, candidates: Mapping[str, Tracker], descript
             axis.plot(aim, drawstyle="steps-post", label="set point", **AIM)
         for (name, run), colour in zip(runs.items(), CANDIDATES, strict=False):
             signal = [*run.y[:, 0].T, *run.u[:, 0].T][index].double() + variable.steady_state
-            axis.plot(signal, linewidth=1.8 if name == POLICY else 1.1, label=name, **look | {"color": colour})
+            dash = LINE_STYLES["expert"] if name == TUNED else "-"
+            axis.plot(signal, linewidth=1.8 if name == POLICY else 1.1, linestyle=dash, label=name, **look | {"color": colour})
     _legend(figure, figure.axes[0].get_legend_handles_labels()[0], 5)
     return figure
 
@@ -95,13 +96,13 @@ def gate_figure(verdict: Verdict) -> Figure:
 
 
 def progress_figure(records: Sequence[GradientRecord]) -> Figure:
-    """Cost, movement and its price over the gradient steps."""
+    """Over the gradient steps the cost (mean |e|, a share of the record's PID's, any excess many times), movement and its price."""
     frame = pd.DataFrame([vars(record) for record in records]).rename(columns=CURVES)
     figure = empty_figure(WIDTH, 3.0)
     for axis, (name, level) in zip(figure.subplots(1, 3), zip(CURVES.values(), (1.0, 1.0, None), strict=True), strict=True):
         axis.plot(frame.index + 1, frame[name], color=SIMULATED, linewidth=1.0, label=name)
         if level is not None:
-            axis.axhline(level, color=INK, linewidth=1.0, linestyle="--", label="the PID")
+            axis.axhline(level, color=INK, linewidth=1.0, linestyle="--", label="the record's PID, or what it allows")
         axis.set_title(name, loc="left")
         axis.set_xlabel("gradient step")
     return figure
@@ -118,7 +119,7 @@ def validation_figure(validation: Validation, description: PlantDescription) -> 
         left.plot(simulated[:, index], color=SIMULATED, label="simulated from the inputs")
         words = f"fit {100 * validation.fit[index]:.0f} % over {len(validation.measured)} windows"
         left.set_title(f"{symbol(variable.name)}: {words}", loc="left")
-        left.set_ylabel(f"deviation, {variable.unit}")
+        left.set_ylabel(f"deviation ({variable.unit})")
         values, reach = acf(validation.residuals[index], nlags=20)[1:], 1.96 / len(validation.residuals[index]) ** 0.5
         right.axhspan(-reach, reach, color=SHADES["left out"], label="95 % of white noise")
         lags = np.arange(1, len(values) + 1)

@@ -212,7 +212,7 @@ def held_out(prediction: pd.DataFrame) -> pd.DataFrame:
     errors = prediction.assign(error=100 * prediction["relative_error"].abs(), deviation=prediction["deviation"].abs())
     rows = []
     for (fitted_on, table), features in errors.groupby(["fitted_on", "table"], sort=False):
-        fitted = fitted_on == "parameter files" or str(table) in fitted_on.removeprefix("Table ").split(" and ")
+        fitted = fitted_on == "parameter files" or str(table) in fitted_on.split()
         row = {"fitted_on": fitted_on, "table": table, "role": "fit" if fitted else "prediction"}
         row |= {"mean_error, %": features["error"].mean(), "greatest_error, %": features["error"].max()}
         rows.append(row | {"greatest_deviation": features["deviation"].max()})

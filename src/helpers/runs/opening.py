@@ -126,7 +126,7 @@ class Run:
         """What kind of run this is, for the top of the notebook; `measure`: of which the smoke run has few."""
         link = f"reports/reference/notebooks/{self.notebook}{copy}.ipynb"
         words = f"{what}, seed {self.seed}"
-        return _banner(self.scale, words, f"a few seconds, few {measure}, results without meaning.", "executed copy", link)
+        return _banner(self.scale, words, f"a short one, few {measure}, results without meaning.", "executed copy", link)
 
 
 def _banner(scale: str, what: str, smoke: str, full: str, link: str) -> Markdown:

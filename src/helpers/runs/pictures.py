@@ -10,5 +10,5 @@ def smaller(png: bytes) -> bytes:
     from PIL import Image  # noqa: PLC0415  # a run without pictures starts without it
 
     palette, found = Image.open(io.BytesIO(png)).convert("RGB"), io.BytesIO()
-    palette.quantize(COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(found, format="PNG", optimize=True)
+    palette.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(found, format="PNG", optimize=True)
     return min(png, found.getvalue(), key=len)

@@ -1,9 +1,8 @@
 """Sessions of notebooks 06 and 08 at a size of their own: one epoch and few trajectories."""
 
-import shutil
+from dataclasses import replace
 
 import pytest
-from ruamel.yaml import YAML
 
 from helpers.evidence.experiments import prepare
 from helpers.runs.session import open_session
@@ -14,16 +13,11 @@ FEW = {"epoch_share": 0.001, "episodes": 4, "measured": 2, "evaluation": 20, "ex
 @pytest.fixture(scope="session")
 def short(root, tmp_path_factory):
     """A session of a case with those parameters."""
-    folder = shutil.copytree(root, tmp_path_factory.mktemp("files") / "params")
-    yaml = YAML(typ="safe", pure=True)
-    content = yaml.load(folder / "learning.yaml")
-    for name, value in FEW.items():
-        content["scales"]["smoke"][name]["value"] = value
-    yaml.dump(content, folder / "learning.yaml")
+    roots = {"params_root": str(root), "input_root": "", "output_root": str(tmp_path_factory.mktemp("results"))}
 
     def build(case, notebook="08_claims"):
-        roots = {"params_root": str(folder), "input_root": "", "output_root": ""}
-        return open_session(notebook, {"case": case, "seed": 0, "scale": "smoke", **roots})
+        session = open_session(notebook, {"case": case, "seed": 0, "scale": "smoke", **roots})
+        return replace(session, scale_params=session.scale_params.model_copy(update=FEW))
 
     return build
 

@@ -14,16 +14,8 @@ from helpers.runs.study import score_table
 @pytest.mark.parametrize("case", [*(pytest.param(case, marks=pytest.mark.torture) for case in (1, 2)), 3])
 def test_every_number_that_the_claims_ask_for_is_there(prepared, root, case):
     run = prepared(case)
-    verbs = (
-        experiments.responses,
-        experiments.readings,
-        experiments.transfer,
-        experiments.frozen_weights,
-        experiments.gradient_spread,
-        alternatives.feature_sets,
-        alternatives.demonstrators,
-        alternatives.robustness,
-    )
+    verbs = [getattr(experiments, name) for name in ("responses", "readings", "transfer", "frozen_weights", "gradient_spread")]
+    verbs += [alternatives.feature_sets, alternatives.demonstrators, alternatives.robustness]
     scores = experiments.online_starts(run)[0]
     for verb in verbs:
         found = verb(run)
@@ -38,12 +30,15 @@ def test_every_number_that_the_claims_ask_for_is_there(prepared, root, case):
                 assert {reference for reference in wanted if reference.startswith("experiments/")} <= known, name
 
 
-def test_some_features_are_the_same_features(prepared):
+def test_some_features_and_the_first_demonstrations_are_the_same(prepared):
     run = prepared()
     features, batch = run.session.features, run.demonstrations.trajectories
     some = SomeFeatures(**vars(features), kept=(0, 3))
     assert torch.equal(some.state(batch), features.state(batch)[..., [0, 3]])
     torch.testing.assert_close(some.trajectory(batch), features.trajectory(batch)[:, [0, 3]], rtol=1e-12, atol=1e-12)
+    found = first(run.demonstrations, 3).trajectories
+    assert torch.equal(found.u, batch.u[:, :3])
+    assert torch.equal(found.y, batch.y[:, :3])
 
 
 def test_conditions(prepared):
@@ -56,23 +51,8 @@ def test_conditions(prepared):
     assert target.expert.set_point.tolist() == [-0.75, 5.0]  # the PID is told of it, as the policies are
     assert target.task.error_scale.tolist() == [-0.75, 5.0]
     assert disturbance.process.disturbance_gain.tolist() == [1.0, 0.6]
-
-
-def test_the_first_demonstrations(prepared):
-    demonstrations = prepared().demonstrations
-    found = first(demonstrations, 3).trajectories
-    assert torch.equal(found.u, demonstrations.trajectories.u[:, :3])
-    assert torch.equal(found.y, demonstrations.trajectories.y[:, :3])
-
-
-class Constant:
-    """A policy that always gives the same input."""
-
-    def __init__(self, value):
-        self.value = torch.tensor(value, dtype=torch.float64)
-
-    def __call__(self, y, u, task):
-        return self.value.expand_as(u), None
+    assert nominal.task.set_point.tolist() == [-1.0, 4.0]  # as it was
+    assert torch.equal(*(torch.rand(3, generator=study.stream("a")) for study in (nominal, target)))
 
 
 def test_the_miss_is_measured_where_hand_control_begins(prepared):
@@ -82,5 +62,8 @@ def test_the_miss_is_measured_where_hand_control_begins(prepared):
     y = torch.stack([torch.zeros(6, dtype=torch.float64), temperature], -1)[:, None]
     u = torch.tensor([[0.0, 60.0], [0, -30], [0, 99], [0, 60], [0, -30]], dtype=torch.float64)[:, None]
     batch = Trajectories(y, y, u, u)
-    assert miss_by_hand(batch, operator, Constant([5.0, -30.0])) == 0.0
-    assert miss_by_hand(batch, operator, Constant([5.0, -18.0])) == pytest.approx(12 / 120)
+    for asked, miss in ((-30.0, 0.0), (-18.0, 12 / 120)):
+        constant = torch.tensor([5.0, asked], dtype=torch.float64)
+        assert miss_by_hand(batch, operator, lambda y, u, task, constant=constant: (constant.expand_as(u), None)) == pytest.approx(
+            miss
+        )

@@ -6,42 +6,27 @@ import torch
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from helpers.evidence.attainable import (
-    Resolution,
-    Tabulated,
-    coefficients,
-    dynamic_programme,
-    expected_closeness,
-    expected_value,
-    grid_around,
-    one_step,
-)
+from helpers.evidence import attainable
+from helpers.evidence.attainable import Resolution, Tabulated, dynamic_programme, one_step
 from helpers.learning.evaluation import objective
 from helpers.learning.features import tracking_reward
-from helpers.plant.controllers import MinimumVariance
 from helpers.plant.rollout import rollout, stream
 
 
-@pytest.mark.parametrize(("mean", "std", "beta"), [(0.0, 0.1, 30.0), (0.05, 0.06, 30.0), (-0.4, 0.3, 10.0), (0.2, 1e-9, 10.0)])
-def test_the_expected_reward_is_the_integral(mean, std, beta):
-    """Against quadrature over the density, where that is not a spike; with a third moment over the series of Gram and Charlier."""
-    found = expected_closeness(np.array(mean), np.array(std), beta)
-    skewness = 0.3
+@pytest.mark.parametrize("skewness", [0.0, 0.3])
+@pytest.mark.parametrize(("mean", "std", "beta"), [(0.0, 0.1, 30.0), (0.05, 0.06, 30.0), (-0.4, 0.3, 10.0)])
+def test_the_expected_reward_is_the_integral(mean, std, beta, skewness):
+    """Against quadrature over the density; with a third moment over the series of Gram and Charlier."""
 
-    def skewed(e):
+    def weighted(e):
         z = (e - mean) / std
         return np.exp(-((beta * e) ** 2)) * norm.pdf(z) / std * (1 + skewness / 6 * (z**3 - 3 * z))
 
-    if std > 1e-6:
-        tilted = quad(skewed, mean - 9 * std, mean + 9 * std, points=[0.0])[0]
-        assert expected_closeness(np.array(mean), np.array(std), beta, skewness * std**3) == pytest.approx(tilted, rel=1e-6)
-    if std < 1e-6:
-        expected = np.exp(-((beta * mean) ** 2))
-    else:
-        expected = quad(
-            lambda e: np.exp(-((beta * e) ** 2)) * norm.pdf(e, mean, std), mean - 9 * std, mean + 9 * std, points=[0.0]
-        )[0]
+    expected = quad(weighted, mean - 9 * std, mean + 9 * std, points=[0.0])[0]
+    found = attainable.expected_closeness(np.array(mean), np.array(std), beta, skewness * std**3)
     assert found == pytest.approx(expected, rel=1e-6)
+    spike = attainable.expected_closeness(np.array(mean), np.array(1e-9), beta, 0.0)
+    assert spike == pytest.approx(np.exp(-((beta * mean) ** 2)), rel=1e-6)
 
 
 @pytest.mark.parametrize(("beta", "place", "tried"), [(10.0, 3 * 9 + 6, (4, 0)), (30.0, 3 * 9 + 5, (3, 0))])
@@ -60,16 +45,17 @@ def test_rewards_and_transitions_are_those_of_the_process(study, beta, place, tr
     for power in (0, 1, 2):
         values = np.add.outer(axes[0] ** power, 0.5 * axes[1] ** power)
         expected = (after[:, 0] ** power + 0.5 * after[:, 1] ** power).mean().item()
-        assert expected_value(step, coefficients(axes, values))[place, *tried] == pytest.approx(expected, rel=2e-3, abs=1e-3)
+        assert attainable.expected_value(step, attainable.coefficients(axes, values))[place, *tried] == pytest.approx(
+            expected, rel=2e-3, abs=1e-3
+        )
 
 
 @pytest.mark.parametrize(("case_number", "beta", "share"), [(1, 30.0, 0.999), (3, 30.0, 1.01)])
 def test_value_and_monte_carlo_agree_and_neither_lies_below_minimum_variance(study, case_number, beta, share):
     """In Case I looking ahead gains nothing, in Case III, where the inputs are slow, some per cent."""
     case = study(case_number, process={"observation_noise": (0.0, 0.0)})
-    known = MinimumVariance(case.process.state_step, case.process.input_step, case.task.set_point)
-    reference = rollout(case.process, known, case.task, 2000, stream(0, "test"))
-    axes = grid_around(reference.x, 31, 0.05)
+    reference = rollout(case.process, case.minimum_variance, case.task, 2000, stream(0, "test"))
+    axes = attainable.grid_around(reference.x, 31, 0.05)
     discount = case.features.params.discount
     optimum = dynamic_programme(case.process, case.task, beta, discount, axes, Resolution(31, 17, 7))
     greedy = rollout(case.process, Tabulated(optimum), case.task, 2000, stream(0, "test"))
@@ -86,9 +72,8 @@ def test_a_last_step_without_noise_goes_to_the_set_point(study):
     axes = (np.linspace(-1.2, -0.8, 7), np.linspace(3.5, 4.5, 7))
     optimum = dynamic_programme(case.process, case.task, 10.0, 1.0, axes, Resolution(7, 201, 3))
     x = torch.tensor([[axes[0][2], axes[1][4]]])
-    known = MinimumVariance(case.process.state_step, case.process.input_step, case.task.set_point)
     found, _ = Tabulated(optimum).act(x, 0)
-    assert found.numpy() == pytest.approx(known.act(x, None)[0].numpy(), abs=0.05)  # they are 0.2 and 0.6 apart
+    assert found.numpy() == pytest.approx(case.minimum_variance.act(x, None)[0].numpy(), abs=0.05)  # they are 0.2 and 0.6 apart
     assert optimum.value_at(x).item() == pytest.approx(2.0, abs=1e-3)
 
 

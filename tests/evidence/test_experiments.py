@@ -12,36 +12,20 @@ from helpers.evidence.experiments import attempt, first_epoch, prepare, response
 from helpers.plant.task import Trajectories
 from helpers.runs.session import open_session
 
-STREAMS = {"input_root": "", "output_root": ""}
-
-
-def trajectories(session, errors):
-    """Two equal trajectories whose normalised error at t = 1..T is given, shape (T, n_y)."""
-    task = session.task
-    error = torch.tensor(errors, dtype=session.dtype)
-    x = torch.cat([torch.zeros_like(error[:1]), task.set_point - error * task.error_scale])[:, None].repeat(1, 2, 1)
-    u = torch.zeros(len(error), 2, 2, dtype=session.dtype)
-    return Trajectories(x, x, u, u)
-
 
 def test_response_figures_by_hand(prepared):
     run = prepared()
     session, comparison = run.session, run.params.comparison.model_copy(update={"n_last": 2})
     # First loop: passes its set point by 0.2, comes back, ends 0.01 short. Second loop: never gets there.
-    batch = trajectories(session, [[1.0, 1.0], [0.0, 0.9], [-0.2, 0.8], [0.04, 0.7], [0.01, 0.6]])
-    found = response_figures(session, batch, comparison)
+    error = torch.tensor([[1.0, 1.0], [0.0, 0.9], [-0.2, 0.8], [0.04, 0.7], [0.01, 0.6]], dtype=session.dtype)
+    x = torch.cat([0 * error[:1], session.task.set_point - error * session.task.error_scale])[:, None].repeat(1, 2, 1)
+    u = torch.zeros(5, 2, 2, dtype=session.dtype)
+    found = response_figures(session, Trajectories(x, x, u, u), comparison)
     dt = session.params.process.sampling_time
-    expected = {
-        "settling_time:C_A": 3 * dt,
-        "settling_time:T": session.task.n_steps * dt,
-        "abs_offset:C_A": 0.025,
-        "abs_offset:T": 0.65,
-        "overshoot:C_A": 0.2,
-        "overshoot:T": 0.0,
-        "excess_travel:C_A": 1.0 + 0.2 + 0.24 + 0.03 - 0.99,
-        "excess_travel:T": 0.0,
-        "rise_time:T": session.task.n_steps * dt,
-    }
+    late = session.task.n_steps * dt
+    expected = {"settling_time:C_A": 3 * dt, "settling_time:T": late, "abs_offset:C_A": 0.025, "abs_offset:T": 0.65}
+    expected |= {"overshoot:C_A": 0.2, "overshoot:T": 0.0, "excess_travel:C_A": 1.0 + 0.2 + 0.24 + 0.03 - 0.99}
+    expected |= {"excess_travel:T": 0.0, "rise_time:T": late}
     assert {name: found[name] for name in expected} == pytest.approx(expected, abs=1e-12)
 
 
@@ -59,23 +43,6 @@ def test_readings_by_hand(prepared):
         assert found[f"not_reached:{n_last}:{name}"] == sum(abs(end) > 0.05 for end in ends) / len(ends)
 
 
-def test_first_epoch():
-    curve = pd.Series([0.0, 5.0, 3.0, 6.0], [1, 2, 3, 4])
-    assert first_epoch(curve, 4.0) == 2
-    assert first_epoch(curve, 7.0) == 5
-
-
-def test_a_varied_session_differs_in_what_was_asked_for_alone(prepared):
-    session = prepared().session
-    other = session.varied(case={"set_point": (2.0, 5.0)}, offline={"epochs": 7}, process={"disturbance": (0.0, 0.0)})
-    assert other.task.set_point.tolist() == [2.0, 5.0]
-    assert other.params.case.offline.epochs == 7
-    assert not other.process.disturbance_gain.any()
-    assert session.task.set_point.tolist() == [-1.0, 4.0]
-    assert (other.params.case.online, other.params.features) == (session.params.case.online, session.params.features)
-    assert torch.equal(torch.rand(3, generator=other.stream("a")), torch.rand(3, generator=session.stream("a")))
-
-
 def test_where_no_reward_can_be_found_the_policy_stays_as_it_was(prepared):
     """exp(-(beta e)^2) is nought in floating point for every error that an untrained policy makes."""
     session = prepared().session
@@ -90,8 +57,9 @@ def test_where_no_reward_can_be_found_the_policy_stays_as_it_was(prepared):
     assert torch.equal(before, after)  # the start itself was not trained
 
 
-def test_the_online_run_of_notebook_03_is_taken_over_and_would_come_out_the_same(root):
-    run = prepare(open_session("08_claims", {"case": 1, "seed": 0, "scale": "smoke", "params_root": str(root), **STREAMS}))
+def test_the_online_run_of_notebook_03_is_taken_over_and_would_come_out_the_same(root, tmp_path):
+    given = {"case": 1, "seed": 0, "scale": "smoke", "params_root": str(root), "input_root": "", "output_root": str(tmp_path)}
+    run = prepare(open_session("08_claims", given))
     betas = run.session.params.case.online.beta
     policy, curve = experiments.from_imitator(run, list(betas))
     assert policy is run.improved
@@ -104,10 +72,8 @@ def test_the_online_run_of_notebook_03_is_taken_over_and_would_come_out_the_same
 
 def test_a_policy_learned_under_weights_follows_them(prepared):
     """With one weight alone, on closeness of the first loop, that feature grows and others may not."""
-    session = replace(
-        prepared().session, scale_params=prepared().session.scale_params.model_copy(update={"episodes": 60, "epoch_share": 1.0})
-    )
-    session = session.varied(features={"beta": 1.0})
+    session = prepared().session.varied(features={"beta": 1.0})
+    session = replace(session, scale_params=session.scale_params.model_copy(update={"episodes": 60, "epoch_share": 1.0}))
     weights = torch.tensor([1.0, 0, 0, 0, 0, 0], dtype=session.dtype)
     means = [
         session.features.trajectory(session.fresh(policy)).mean(0)[0].item()
@@ -123,14 +89,13 @@ def test_the_baseline_lowers_the_spread(prepared):
     assert all(0 < found[f"variance:{kind}"] < 0.5 for kind in ("mean", "regression"))
 
 
-def test_what_is_not_planned_is_not_run(prepared):
-    run = prepared(3)
-    assert alternatives.feature_sets(run) == {}
-    assert set(experiments.online_starts(run)[0]) == {"hot", "scratch", "scratch_dense"}
-
-
-def test_transfer_counts_epochs_of_both_histories(prepared):
+def test_transfer_counts_epochs_of_both_histories_and_what_is_not_planned_is_not_run(prepared):
+    curve = pd.Series([0.0, 5.0, 3.0, 6.0], [1, 2, 3, 4])
+    assert [first_epoch(curve, level) for level in (4.0, 7.0)] == [2, 5]
     assert experiments.transfer(prepared(1)) == {}
-    found = experiments.transfer(prepared(3))
+    run = prepared(3)
+    found = experiments.transfer(run)
     assert found["from_scratch"]["epochs_to_level"] <= 8  # the length of the smoke run's history
     assert found["transfer"]["epochs_to_level"] <= 9
+    assert alternatives.feature_sets(run) == {}
+    assert set(experiments.online_starts(run)[0]) == {"hot", "scratch", "scratch_dense"}

@@ -10,12 +10,9 @@ import torch
 from scipy.integrate import solve_ivp
 
 from helpers.evidence.identification import Fit, Problem, Profile, polish, profile, refit, search, steps
-from helpers.evidence.readings import GAINS, MAIN, READINGS, TIME, Reading, ReadProcess, exact_drift, simulate, with_settings
-from helpers.learning.features import FeatureMap
-from helpers.plant.controllers import PID
+from helpers.evidence.readings import GAINS, MAIN, TIME, Reading, ReadProcess, exact_drift, simulate, with_settings
 from helpers.plant.process import LinearProcess
 from helpers.plant.rollout import rollout, stream
-from helpers.plant.task import ControlTask
 from helpers.runs.request import PROJECT
 from helpers.settings.evidence import load_identification
 from helpers.settings.leaf import ParameterError
@@ -24,7 +21,7 @@ from helpers.settings.paper import load
 ROOT = PROJECT / "params"
 CASES = {case: load(ROOT, case) for case in (1, 2, 3)}
 FIRST = CASES[1]
-BOUND_T, BOUND_C = ("input_bound", "T_E"), ("input_bound", "C_A0")
+BOUND_T = ("input_bound", "T_E")
 TRUTH = {TIME: 0.05, BOUND_T: 45.0}
 AS_FILED = Reading(first_error=None)
 REFERENCE = PROJECT / "reports/reference/inferred_settings"
@@ -34,41 +31,34 @@ def draws(seed=0, case=1):
     return stream(seed, case, "inferred_settings")
 
 
-def recorded(params, n_trajectories=40):
-    """Trajectories of a case's demonstrator by the package's own way, on the draws of `draws`."""
-    task = ControlTask.from_params(params.process, params.case, torch.float64)
-    pid = PID(params.demonstrator, task.set_point, params.process.sampling_time)
-    return rollout(LinearProcess(params.process, torch.float64), pid, task, n_trajectories, draws()), task
+def features(reading, params=FIRST):
+    """v of a case's demonstrator under a reading, with the settings of the files, on the same draws."""
+    return simulate(params, {}, reading, 40, draws()).v
 
 
 # Readings ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_first_reading_without_settings_is_the_demonstrator_of_the_parameter_files(case):
-    params = CASES[case]
-    trajectories, task = recorded(params)
-    expected = FeatureMap(params.features, task, params.process.sampling_time).trajectory(trajectories)
-    torch.testing.assert_close(simulate(params, {}, AS_FILED, 40, draws()).v, expected, rtol=0, atol=0)
+def test_the_first_reading_without_settings_is_the_demonstrator_of_the_parameter_files(study, case):
+    filed = study(case)
+    expected = filed.features.trajectory(rollout(filed.process, filed.pid, filed.task, 40, draws()))
+    torch.testing.assert_close(features(AS_FILED, CASES[case]), expected, rtol=0, atol=0)
 
 
 def test_settings_take_the_place_of_those_of_the_files():
     values = {TIME: 0.03, BOUND_T: 50.0, ("input_low", "C_A0"): -7.0, ("integral", "T"): 99.0}
-    params = with_settings(FIRST, values, AS_FILED)
+    params = with_settings(FIRST, values, Reading(noise_as_variance=True, start_as_variance=True, samples=49, integration_steps=3))
     high = FIRST.process.input_high
     assert params.process.sampling_time == 0.03
     assert params.process.input_low == (-7.0, -50.0)
     assert params.process.input_high == (high[0], 50.0)
+    assert (params.process.horizon, params.process.integration_steps) == (49, 3)
     assert params.demonstrator.integral == (FIRST.demonstrator.integral[0], 99.0)
     assert params.demonstrator.proportional == FIRST.demonstrator.proportional
     assert FIRST.process.sampling_time != 0.03  # the files' record stays as it was
-
-
-def test_a_variance_is_the_square_of_a_standard_deviation():
-    noise = with_settings(FIRST, {}, Reading(noise_as_variance=True)).process.observation_noise
-    start = with_settings(FIRST, {}, Reading(start_as_variance=True)).case.initial_std
-    assert [value**2 for value in noise] == pytest.approx(FIRST.process.observation_noise)
-    assert [value**2 for value in start] == pytest.approx(FIRST.case.initial_std)
+    assert [value**2 for value in params.process.observation_noise] == pytest.approx(FIRST.process.observation_noise)
+    assert [value**2 for value in params.case.initial_std] == pytest.approx(FIRST.case.initial_std)
 
 
 def test_the_exact_drift_is_the_solution_of_the_undisturbed_equation():
@@ -87,13 +77,8 @@ def test_the_exact_drift_is_the_solution_of_the_undisturbed_equation():
 def test_finer_steps_keep_the_mean_of_the_exact_drift_and_spread_as_an_integral():
     """One loop without coupling at rest: x' = a x + b u + d x w has a mean and a second moment in closed form over a sample."""
     a, b, d, dt, x0, u0 = -4.0, 0.5, 0.5, 0.04, 1.0, 20.0
-    update = {
-        "drift_state": ((a, 0.0), (0.0, a)),
-        "drift_input": ((b, 0.0), (0.0, b)),
-        "disturbance": (d, d),
-        "sampling_time": dt,
-        "integration_steps": 16,
-    }
+    update = {"drift_state": ((a, 0.0), (0.0, a)), "drift_input": ((b, 0.0), (0.0, b)), "disturbance": (d, d)}
+    update |= {"sampling_time": dt, "integration_steps": 16}
     generator = torch.Generator().manual_seed(0)
     finer = ReadProcess(FIRST.process.model_copy(update=update), MAIN, generator)
     ones = torch.ones(200_000, 2, dtype=torch.float64)
@@ -103,18 +88,14 @@ def test_finer_steps_keep_the_mean_of_the_exact_drift_and_spread_as_an_integral(
     ).y[:, -1]
     assert x.mean().item() == pytest.approx(moments[0], rel=2e-3)
     assert x.var().item() == pytest.approx(moments[1] - moments[0] ** 2, rel=2e-2)
-    reading = Reading(integration_steps=3)
-    assert with_settings(FIRST, {}, reading).process.integration_steps == 3
-    assert simulate(FIRST, {}, reading, 20, draws()).v.equal(simulate(FIRST, {}, reading, 20, draws()).v)
 
 
-def test_the_error_of_the_initial_state_takes_the_place_of_the_number():
+def test_the_error_of_the_initial_state_takes_the_place_of_the_number(study):
     """Type III at t = 1 by hand from the true states; all later ones stay."""
-    trajectories, _ = recorded(FIRST)
-    target = torch.tensor(FIRST.case.set_point, dtype=torch.float64)
-    first = ((target - trajectories.x[0]) / target).abs()
-    given = simulate(FIRST, {}, AS_FILED, 40, draws()).v
-    own = simulate(FIRST, {}, MAIN, 40, draws()).v
+    filed = study(1)
+    start = rollout(filed.process, filed.pid, filed.task, 40, draws()).x[0]
+    first = ((filed.task.set_point - start) / filed.task.set_point).abs()
+    given, own = features(AS_FILED), features(MAIN)
     torch.testing.assert_close(own[:, :4], given[:, :4])
     torch.testing.assert_close(own[:, 4:] - given[:, 4:], (FIRST.features.initial_error - first) / FIRST.process.sampling_time)
 
@@ -147,15 +128,9 @@ def one_loop_by_hand(n_steps, reading):
 
 @pytest.mark.parametrize(
     "changes",
-    [
-        {},
-        {"conditional_integration": True},
-        {"derivative_from_zero": True},
-        {"bounded_integral": True},
-        {"present_error": 0.5},
-        {"error_memory": 0.5},
-        {"delay": True},
-    ],
+    [{}]
+    + [{name: True} for name in ("conditional_integration", "derivative_from_zero", "bounded_integral", "delay")]
+    + [{name: 0.5} for name in ("present_error", "error_memory")],
 )
 def test_the_pid_of_a_reading_without_noise(changes, monkeypatch):
     process = FIRST.process.model_copy(update={"observation_noise": (0.0, 0.0), "disturbance": (0.0, 0.0)})
@@ -203,33 +178,16 @@ def test_the_disturbance_of_several_steps_comes_once_at_the_end_and_as_wide():
 
 def test_what_the_controller_sees_and_what_the_types_are_taken_of():
     x, noise = torch.ones(4, 2, dtype=torch.float64), torch.ones(4, 2, dtype=torch.float64)
-    seen = {
-        name: ReadProcess(FIRST.process, Reading(**{name: True}), torch.Generator()) for name in ("acts_on_state", "observed_state")
-    }
-    assert all(process.observe(x, noise).equal(x) for process in seen.values())
-    after = [process.step(x, x, torch.zeros(4, 8).double()) for process in seen.values()]
-    assert (after[1] / after[0] - 1).abs().min() > 0
-    of = {
-        name: simulate(FIRST, {}, reading, 40, draws()).v
-        for name, reading in (
-            ("x", MAIN),
-            ("y", Reading(features_on="y")),
-            ("II", Reading(accumulated_on="y")),
-            ("III", Reading(rate_on="y")),
-        )
-    }
-    assert of["II"].equal(torch.cat([of["x"][:, :2], of["y"][:, 2:4], of["x"][:, 4:]], 1))
-    assert of["III"].equal(torch.cat([of["x"][:, :4], of["y"][:, 4:]], 1))
-    assert with_settings(FIRST, {}, Reading(samples=49)).process.horizon == 49
-
-
-def test_the_readings_are_many_and_differ():
-    assert (
-        len({replace(reading, name="") for reading in READINGS})
-        == len({reading.name for reading in READINGS})
-        == len(READINGS)
-        >= 30
+    acts, observed = (
+        ReadProcess(FIRST.process, Reading(**{name: True}), torch.Generator()) for name in ("acts_on_state", "observed_state")
     )
+    assert acts.observe(x, noise).equal(x)
+    assert observed.observe(x, noise).equal(x)
+    still = torch.zeros(4, 8).double()
+    assert (observed.step(x, x, still) / acts.step(x, x, still) - 1).abs().min() > 0
+    of_x, of_y = features(MAIN), features(Reading(features_on="y"))
+    assert features(Reading(accumulated_on="y")).equal(torch.cat([of_x[:, :2], of_y[:, 2:4], of_x[:, 4:]], 1))
+    assert features(Reading(rate_on="y")).equal(torch.cat([of_x[:, :4], of_y[:, 4:]], 1))
 
 
 def test_an_unstable_loop_costs_much_and_stays_finite():
@@ -255,13 +213,9 @@ def known(**changes):
     return replace(problem, **changes)
 
 
-def test_the_sampling_error_is_that_of_a_mean():
-    v = simulate(FIRST, {}, AS_FILED, 60, draws())
-    np.testing.assert_allclose(v.sampling_error(500), np.std(v.v.numpy(), axis=0, ddof=1) / np.sqrt(500))
-
-
 def test_the_loss_counts_squared_sampling_errors():
-    problem = known()
+    problem, v = known(), simulate(CASES[1], TRUTH, AS_FILED, 60, draws())
+    np.testing.assert_allclose(problem.sampling_error[1], np.std(v.v.numpy(), axis=0, ddof=1) / np.sqrt(500))
     z = problem.position(TRUTH)
     assert problem.loss(z, 60) == pytest.approx(0.0, abs=1e-18)
     shifted = {case: np.asarray(row) + 2 * problem.sampling_error[case] for case, row in problem.published.items()}
@@ -279,11 +233,8 @@ def test_overshoot_costs_where_it_is_not_allowed():
 
 def test_known_settings_are_found_again():
     problem = known()
-    scale = (
-        load_identification(ROOT, FIRST)
-        .scales["smoke"]
-        .model_copy(update={"evaluations_reading": 60, "draws_search": 60, "draws": 60, "iterations": 30})
-    )
+    size = {"evaluations_reading": 60, "draws_search": 60, "draws": 60, "iterations": 30}
+    scale = load_identification(ROOT, FIRST).scales["smoke"].model_copy(update=size)
     found = refit(problem, {TIME: 0.04, BOUND_T: 60.0}, scale)
     assert found.loss < 1e-3
     assert found.settings == pytest.approx(TRUTH, rel=1e-3)

@@ -53,10 +53,3 @@ def test_an_interrupted_profile_is_not_walked_twice(study, monkeypatch):
     assert np.array_equal(walked.grid, again.grid)
     assert np.array_equal(walked.losses, again.losses)
     assert len(walked.grid) > 1
-
-
-def test_what_was_kept_goes_when_the_results_are_written(study):
-    study.refit(study.problem(study.first), study.filed(study.first))
-    assert study.session.finished.folder.is_dir()
-    study.session.save("inferred_settings", {})
-    assert not study.session.finished.folder.exists()

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from helpers.evidence.kalman import Filtered
-from helpers.plant.controllers import MinimumVariance
 from helpers.plant.rollout import rollout, stream
 
 
@@ -56,13 +55,3 @@ def test_the_estimate_is_nearer_to_the_state_than_the_reading(study):
     estimate = torch.stack(spy.seen)
     mine, reading = ((signal[5:] - batch.x[5:-1]).square().mean((0, 1)) for signal in (estimate, batch.y[:-1]))
     assert (mine < 0.97 * reading).all()
-
-
-def test_without_noise_it_changes_nothing(study):
-    case = study(1, process={"observation_noise": (0.0, 0.0)})
-    known = MinimumVariance(case.process.state_step, case.process.input_step, case.task.set_point)
-    plain, filtered = (
-        rollout(case.process, controller, case.task, 20, stream(0, "same"))
-        for controller in (known, Filtered(known, case.process, case.task))
-    )
-    assert torch.allclose(plain.u, filtered.u, atol=1e-9)

@@ -35,45 +35,32 @@ def test_gymnasium_finds_nothing_wrong(make):
     check_env(make()[1], skip_render_check=True)
 
 
-def test_an_episode_is_that_of_the_process(make):
-    """Without noise: states, rewards and what is seen, step by step through the process itself."""
+def test_episodes_are_those_of_the_process(make):
+    """Without noise: states, rewards and what is seen, step by step through the process itself; the first also on its own."""
     case, env = make(disturbance=(0.0, 0.0), observation_noise=(0.0, 0.0))
-    seen, _ = env.reset(seed=3)
-    x = torch.tensor(env.x)[None]
-    scaling = case.policy().scaling(case.task)
-    previous = torch.zeros_like(case.task.input_low)[None]
-    for t in range(case.task.n_steps):
-        assert seen == pytest.approx(scaling.inputs(x, previous)[0].numpy(), rel=1e-5, abs=1e-6)
-        action = np.array([0.3, -1.7])  # the second lies beyond the bound
-        seen, reward, over, cut, info = env.step(action)
-        low, high = case.task.input_low, case.task.input_high
-        previous = ((high + low) / 2 + (high - low) / 2 * torch.tensor([0.3, -1.0]))[None]
-        x = case.process.step(x, previous, torch.zeros_like(x))
-        assert info["x"] == pytest.approx(x[0].numpy())
-        assert info["u"] == pytest.approx(previous[0].numpy())
-        error = (case.task.set_point - x) / case.task.error_scale
-        assert reward == pytest.approx(tracking_reward(error, 10.0).item(), abs=1e-12)
-        assert (over, cut) == (t == case.task.n_steps - 1, False)
-
-
-def test_episodes_side_by_side_are_single_ones(make):
-    """Without noise after the start: each episode of the batch is the single environment's from the same state."""
-    _, env = make(disturbance=(0.0, 0.0), observation_noise=(0.0, 0.0))
     batch = TrackingEnvs(make(disturbance=(0.0, 0.0), observation_noise=(0.0, 0.0))[1], 3)
     batch.seed(5)
     first = batch.reset()
-    starts = batch.env.x.copy()
-    actions = np.random.default_rng(0).uniform(-1.5, 1.5, (env.n_steps, 3, 2))
-    seen, rewards, ends, infos = zip(*(batch.step(action) for action in actions), strict=True)
-    for k in range(3):
-        env.reset(seed=0)
-        env.x = starts[k]
-        for t, action in enumerate(actions[:, k]):
-            expected, reward, over, _, _ = env.step(action)
-            assert rewards[t][k] == pytest.approx(reward, abs=1e-12)
-            assert ends[t][k] == over
-            assert (infos[t][k]["terminal_observation"] if over else seen[t][k]) == pytest.approx(expected, abs=1e-6)
-    assert not np.allclose(seen[-1], first)  # the next episodes have begun, from other states
+    env.reset(seed=3)
+    env.x = batch.env.x[0]
+    x, scaling = torch.tensor(batch.env.x), case.policy().scaling(case.task)
+    low, high = case.task.input_low, case.task.input_high
+    assert first == pytest.approx(scaling.inputs(x, torch.zeros_like(x)).numpy(), rel=1e-5, abs=1e-6)
+    for action in np.random.default_rng(0).uniform(-1.5, 1.5, (env.n_steps, 3, 2)):  # some lie beyond the bounds
+        seen, rewards, ends, infos = batch.step(action)
+        alone, reward, over, cut, info = env.step(action[0])
+        u = (high + low) / 2 + (high - low) / 2 * torch.tensor(action).clamp(-1, 1)
+        x = case.process.step(x, u, torch.zeros(3, case.process.n_disturbances, dtype=x.dtype))
+        last = [entry["terminal_observation"] for entry in infos] if over else seen
+        assert np.array(last) == pytest.approx(scaling.inputs(x, u).numpy(), rel=1e-5, abs=1e-6)
+        assert alone == pytest.approx(last[0], abs=1e-6)
+        assert info["x"] == pytest.approx(x[0].numpy())
+        assert info["u"] == pytest.approx(u[0].numpy())
+        assert rewards == pytest.approx(tracking_reward((case.task.set_point - x) / case.task.error_scale, 10.0).numpy(), abs=1e-12)
+        assert reward == pytest.approx(rewards[0], abs=1e-12)
+        assert (list(ends), cut) == ([over] * 3, False)
+    assert over
+    assert not np.allclose(seen, first)  # the next episodes have begun, from other states
     batch.seed(5)
     assert np.array_equal(batch.reset(), first)
 

@@ -14,6 +14,7 @@ from helpers.learning.evaluation import objective
 from helpers.plant.controllers import PID
 from helpers.report import limits_answer
 from helpers.report.limits_figures import LABELS, budget_curves, gap_figure, heat_maps, regret_figure
+from tests.plant.test_controllers import run
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +47,7 @@ def test_the_grids_say_whether_they_agree(contest, attained):
 
 
 @pytest.mark.torture
-def test_every_alternative_has_a_curve_and_spends_no_more_than_its_budget(contest, learned):
+def test_every_alternative_has_a_curve_within_its_budget_and_what_does_not_learn_keeps_its_value(contest, learned):
     curves = equal_budget.curves(learned)
     ending = {"irl_alone"} | {f"{start}_reinforce" for start in ("irl", "clone", "csil", "scratch")}
     assert set(learned) == {"clone", *ending, "pid_tuned", "pid_scheduled", "mpc", "one_policy"}
@@ -59,11 +60,7 @@ def test_every_alternative_has_a_curve_and_spends_no_more_than_its_budget(contes
     assert last[["irl_reinforce", "scratch_reinforce"]].tolist() == [24, 24]
     assert last[["clone", "mpc", "one_policy"]].tolist() == [0, 0, 0]
     assert 0 < last["pid_tuned"] <= 24
-
-
-@pytest.mark.torture
-def test_what_does_not_learn_keeps_its_value_at_every_budget(contest, learned):
-    table = equal_budget.at_budgets(equal_budget.curves(learned), contest)
+    table = equal_budget.at_budgets(curves, contest)
     assert table.columns.tolist() == [0, 12, 24]
     assert (table.loc["mpc"] == table.loc["mpc", 0]).all()
     assert table.notna().all(axis=None)
@@ -78,25 +75,18 @@ def test_constant_weights_schedule_nothing_and_others_follow_the_error(contest):
     unit, target = torch.tensor([0.1, 0.4], dtype=torch.float64), session.task.set_point
     observed = torch.randn(6, 4, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
-    def commands(controller):
-        memory, found = controller.start(4, 6, torch.Generator()), []
-        for y in observed:
-            u, memory = controller.act(y, memory)
-            found.append(u)
-        return torch.stack(found)
-
     def scheduled(weights):
         return ScheduledPID(weights, given, 0.1, unit, target, session.task, dt)
 
     weights = torch.zeros(2, ScheduledPID.n_weights(2, 3), dtype=torch.float64)
-    plain = commands(scheduled(weights))
-    assert torch.allclose(plain, commands(PID(given, target, dt)))
+    plain = run(scheduled(weights), observed)
+    assert torch.allclose(plain, run(PID(given, target, dt), observed))
     weights[1, -24:] = torch.tensor([0.0, 0.0, 0.0, 2.0], dtype=torch.float64).log1p().repeat(6)  # every constant ln 3
     weights[1, -8:] = 0
     tripled = given.model_copy(update={name: tuple(3 * gain for gain in gains[name]) for name in ("proportional", "integral")})
-    both = commands(scheduled(weights))
+    both = run(scheduled(weights), observed)
     assert torch.allclose(both[:, :2], plain[:, :2])  # the first of two controllers side by side
-    assert torch.allclose(both[:, 2:], commands(PID(tripled, target, dt))[:, 2:])
+    assert torch.allclose(both[:, 2:], run(PID(tripled, target, dt), observed)[:, 2:])
     weights[0, 0], weights[0, -24] = 1.0, 1.0  # a cell that sees the first error, and the first gain that follows it
     error = (target - observed[0]) / unit
     p, _, _ = scheduled(weights).gains(target - observed[0])

@@ -7,7 +7,6 @@ from scipy.optimize import minimize
 
 from helpers.evidence.mismatch import LoadStep
 from helpers.evidence.mpc import OffsetFreeMPC
-from helpers.plant.controllers import MinimumVariance
 from helpers.plant.rollout import rollout, stream
 
 
@@ -43,8 +42,7 @@ def test_no_offset_remains_after_an_unmeasured_load(study):
     case = study(1, process=quiet, case_study={"initial_std": (0.0, 0.0)})
     load = 0.03 * case.task.error_scale
     ends = {}
-    known = MinimumVariance(case.process.state_step, case.process.input_step, case.task.set_point)
-    for name, controller in {"mpc": OffsetFreeMPC(case.process, case.task, 10, 0.01, 0.1), "known": known}.items():
+    for name, controller in {"mpc": OffsetFreeMPC(case.process, case.task, 10, 0.01, 0.1), "known": case.minimum_variance}.items():
         batch = rollout(LoadStep(case.process, case.task, load), controller, case.task, 1, stream(0, "load"))
         ends[name] = ((batch.x[-1, 0] - case.task.set_point) / case.task.error_scale).abs().max().item()
     assert ends["mpc"] < 1e-3
@@ -54,11 +52,10 @@ def test_no_offset_remains_after_an_unmeasured_load(study):
 def test_a_short_horizon_without_move_penalty_is_minimum_variance(study):
     case = study(1)
     controller = OffsetFreeMPC(case.process, case.task, 1, 1e-9, 0.1)
-    known = MinimumVariance(case.process.state_step, case.process.input_step, case.task.set_point)
     x = torch.tensor([[-0.95, 3.9]], dtype=torch.float64)
     rest = torch.zeros(1, 2, dtype=torch.float64)
     plan = controller.plan(torch.cat([x, rest, rest, torch.ones(1, 1, dtype=torch.float64)], 1).numpy())
-    assert plan == pytest.approx(known.act(x, None)[0].numpy(), rel=1e-3)
+    assert plan == pytest.approx(case.minimum_variance.act(x, None)[0].numpy(), rel=1e-3)
 
 
 def test_single_precision_changes_little(study):

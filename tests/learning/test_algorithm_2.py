@@ -1,5 +1,6 @@
 """Algorithm 2: the MaxEnt gradient against the log-likelihood itself, the ascent step, and the outer loop."""
 
+import copy
 from itertools import pairwise
 
 import numpy as np
@@ -59,7 +60,7 @@ def test_plain_ascent_reaches_matching_features():
     features = normal(9, 3, seed=4)
     target = 0.5 * features[2] + 0.3 * features[5] + 0.2 * features.mean(0)
     alpha = torch.zeros(3, dtype=F64)
-    for _ in range(20_000):
+    for _ in range(500):
         probability = torch.softmax(features @ alpha, 0)
         alpha = alpha + 0.2 * maxent_gradient(target, probability @ features)
     torch.testing.assert_close(torch.softmax(features @ alpha, 0) @ features, target, rtol=1e-6, atol=1e-6)
@@ -69,33 +70,25 @@ def test_plain_ascent_reaches_matching_features():
 
 
 @pytest.mark.equation("3.4.6")
-@pytest.mark.parametrize(
-    ("start", "gradient", "expected"),
-    [
-        # (0.6, 0.8, 0) + 0.1 (-1, -8, 0) = (0.5, 0, 0), of norm 0.5.
-        ([0.6, 0.8, 0.0], [-1.0, -8.0, 0.0], np.array([1, 0, 0])),
-        # (0.6, -0.8, 0) + 0.1 (50, -50, 50) leaves the box on every side: three weights at one bound, as in Table 3.
-        ([0.6, -0.8, 0.0], [50.0, -50.0, 50.0], np.array([1, -1, 1]) / np.sqrt(3)),
-    ],
-)
-def test_the_printed_step_by_hand_is_clipped_before_it_is_normalised(weights_of, start, gradient, expected):
-    ascent = WeightAscent(weights_of(bound=0.5), torch.tensor(start, dtype=F64), torch.ones(3, dtype=F64))
-    ascent.step(torch.tensor(gradient, dtype=F64))
-    np.testing.assert_allclose(ascent.weights, expected, atol=1e-14)
-
-
-@pytest.mark.equation("3.4.6")
 @pytest.mark.parametrize("decay", [0.0, 0.3])
 @pytest.mark.parametrize("scaled", [False, True])
 @pytest.mark.parametrize("averaging", [0.0, 0.9])
-def test_weights_stay_finite_and_of_unit_norm(weights_of, decay, scaled, averaging):
-    params = weights_of(decay=decay, scaled_by_expert=scaled, averaging=averaging, bound=0.7)
-    ascent = WeightAscent(params, project(normal(6)), 20 * normal(6, seed=2))
+def test_the_steps_against_plain_numpy(weights_of, decay, scaled, averaging):
+    """Clipped before they are normalised; as printed they go on from alpha itself, with decay from what was clipped."""
+    expert = 2 * normal(6, seed=2)
+    ascent = WeightAscent(
+        weights_of(decay=decay, scaled_by_expert=scaled, averaging=averaging, bound=0.7), project(normal(6)), expert
+    )
+    raw = alpha = mean = project(normal(6)).numpy()
     for index in range(50):
-        ascent.step(30 * normal(6, seed=10 + index))
-        for weights in (ascent.weights, ascent.result):
-            assert weights.norm().item() == pytest.approx(1, rel=1e-12)
-        assert ascent.raw.abs().max() <= 0.7
+        gradient = 5 * normal(6, seed=10 + index)
+        ascent.step(gradient)
+        step = 0.1 * gradient.numpy() / (np.abs(expert.numpy()) if scaled else 1)
+        raw = np.clip((1 - decay) * (raw if decay else alpha) + step, -0.7, 0.7)
+        alpha = raw / np.linalg.norm(raw)
+        mean = averaging * mean + (1 - averaging) * alpha
+        np.testing.assert_allclose(ascent.weights, alpha, rtol=1e-10)
+        np.testing.assert_allclose(ascent.result, mean / np.linalg.norm(mean), rtol=1e-10)
 
 
 def test_decay_is_the_gradient_of_a_gaussian_prior(weights_of):
@@ -108,24 +101,6 @@ def test_decay_is_the_gradient_of_a_gaussian_prior(weights_of):
     ascent = WeightAscent(weights_of(step=0.01, decay=0.2, bound=10.0), start, torch.ones(3, dtype=F64))
     ascent.step(maxent_gradient(expert, torch.softmax(features @ start, 0) @ features))
     np.testing.assert_allclose((ascent.raw - start) / 0.01, differences(log_posterior, start.numpy()), rtol=1e-6, atol=1e-8)
-
-
-def test_scaling_measures_each_feature_in_units_of_the_experts(weights_of):
-    """Counting a feature in another unit leaves the scaled step in relative terms as it was."""
-    start, expert, policy = project(normal(3)), torch.tensor([20.0, -4.0, 0.5], dtype=F64), normal(3, seed=1)
-    ascent = WeightAscent(weights_of(scaled_by_expert=True, bound=10.0), start, expert)
-    ascent.step(maxent_gradient(expert, policy))
-    np.testing.assert_allclose(ascent.raw, (start + 0.1 * (expert - policy) / expert.abs()).numpy(), rtol=1e-12)
-
-
-@pytest.mark.parametrize("averaging", [0.0, 0.75])
-def test_the_result_is_the_running_mean_of_the_weights(weights_of, averaging):
-    ascent = WeightAscent(weights_of(averaging=averaging), project(normal(4)), torch.ones(4, dtype=F64))
-    mean = ascent.weights
-    for index in range(5):
-        ascent.step(normal(4, seed=20 + index))
-        mean = averaging * mean + (1 - averaging) * ascent.weights
-    torch.testing.assert_close(ascent.result, mean / mean.norm(), rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("n_loops", [1, 2, 3])
@@ -196,7 +171,7 @@ def test_the_result_is_reproducible_bit_for_bit(study, weights_of, credit, minib
         return algorithm_2(learner, expert, start.float(), weights_of(scaled_by_expert=True), 3, 5)
 
     first = run()
-    torch.manual_seed(17)  # the global generator plays no part
+    torch.manual_seed(17)  # the global generator plays no part, in the first weights neither
     second = run()
     assert first.records == second.records
     assert torch.equal(first.weights, second.weights)
@@ -214,17 +189,12 @@ def test_the_nearest_epoch_is_kept_where_asked(study, weights_of):
     gaps = [record.feature_gap for record in last.records]
     assert last.chosen_epoch == n_epochs
     assert all(torch.equal(a, b) for a, b in zip(last.policy.parameters(), learner.policy.parameters(), strict=True))
+    before = copy.deepcopy(last.policy)
+    algorithm_1(learner, lambda batch: batch.x[1:, :, 0], 1)  # learning goes on without touching the kept policy
+    assert all(torch.equal(a, b) for a, b in zip(last.policy.parameters(), before.parameters(), strict=True))
     _, nearest = run(True)
     assert [record.feature_gap for record in nearest.records] == gaps
     assert nearest.chosen_epoch == 1 + int(np.argmin(gaps)) < n_epochs  # an earlier epoch, so that the choice shows
-
-
-def test_learning_goes_on_without_touching_the_kept_policy(study, weights_of):
-    learner, expert, start = setting(study())
-    result = algorithm_2(learner, expert, start, weights_of(), 2, 5)
-    before = [parameter.detach().clone() for parameter in result.policy.parameters()]
-    algorithm_1(learner, lambda batch: batch.x[1:, :, 0], 1)
-    assert all(torch.equal(a, b) for a, b in zip(result.policy.parameters(), before, strict=True))
 
 
 def test_early_stopping_ends_an_iteration_early(study, weights_of):
@@ -233,18 +203,7 @@ def test_early_stopping_ends_an_iteration_early(study, weights_of):
     assert result.records[-1].epochs < 20
 
 
-def test_features_come_nearer_the_experts(study, weights_of):
-    """A short run of the improved variant on Case Study I, from a policy that leaves the inputs near zero."""
-    case = study(1, torch.float32)
-    variant = case.params.learning.variants["improved"]
-    expert = expected_features(case.process, case.pid, case.features, 200, stream(0, "expert"))
-    learner = case.learner(case.policy(), 100, 40, variant.learner)
-    start = initial_weights(variant.weights, 2, torch.float32)
-    gaps = [record.feature_gap for record in algorithm_2(learner, expert, start, variant.weights, 40, 50).records]
-    assert np.mean(gaps[-5:]) < 0.5 * gaps[0]
-
-
-@pytest.mark.parametrize(("n_controlled", "n_manipulated"), [(1, 1), (3, 3), (3, 2)])
+@pytest.mark.parametrize(("n_controlled", "n_manipulated"), [(1, 1), (3, 2)])
 @pytest.mark.parametrize("variant", ["improved", "printed"])
 def test_any_number_of_variables_and_features(synthetic, n_controlled, n_manipulated, variant):
     case = synthetic(n_controlled, n_manipulated)

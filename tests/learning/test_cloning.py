@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch.nn.utils import parameters_to_vector
 
 from helpers.learning.cloning import clone, cloning_loss
 from helpers.learning.learner import TrainingError
@@ -22,10 +23,6 @@ def params(root, study):
 def demonstrations(study):
     case = study()
     return rollout(case.process, case.pid, case.task, 12, stream(0, "demonstrations"))
-
-
-def parameters(policy):
-    return torch.cat([entry.detach().flatten() for entry in policy.parameters()])
 
 
 def test_loss_of_a_policy_that_always_gives_the_same_input(study, demonstrations):
@@ -48,7 +45,7 @@ def test_cloning_learns_and_repeats(study, demonstrations, params):
     before = cloning_loss(case.policy(), demonstrations, held, case.task).item()
     runs = [clone(case.policy(), demonstrations, case.task, params, 75, stream(1)) for _ in range(2)]
     assert runs[0].loss < before / 2
-    assert torch.equal(parameters(runs[0].policy), parameters(runs[1].policy))
+    assert torch.equal(parameters_to_vector(runs[0].policy.parameters()), parameters_to_vector(runs[1].policy.parameters()))
     assert cloning_loss(runs[0].policy, demonstrations, held, case.task).item() == pytest.approx(runs[0].loss, rel=1e-12)
 
 
@@ -56,9 +53,9 @@ def test_what_is_held_back_is_not_learned_from(study, demonstrations, params):
     case = study()
     spoilt = copy.deepcopy(demonstrations)
     spoilt.u[:, 10:] = -spoilt.u[:, 10:]
-    once = params.model_copy(update={"check_every": 30})  # only the last step is looked at
-    found = [clone(case.policy(), data, case.task, once, 30, stream(1)) for data in (demonstrations, spoilt)]
-    assert torch.equal(parameters(found[0].policy), parameters(found[1].policy))
+    once = params.model_copy(update={"check_every": 6})  # only the last step is looked at
+    found = [clone(case.policy(), data, case.task, once, 6, stream(1)) for data in (demonstrations, spoilt)]
+    assert torch.equal(parameters_to_vector(found[0].policy.parameters()), parameters_to_vector(found[1].policy.parameters()))
     assert found[0].loss != found[1].loss
 
 
@@ -66,9 +63,8 @@ def test_the_step_with_the_least_loss_is_kept(study, demonstrations, params):
     case = study()
     wild = params.model_copy(update={"learning_rate_start": 0.5, "learning_rate_end": 0.5, "check_every": 1})
     found = clone(case.policy(), demonstrations, case.task, wild, 12, stream(1))
-    shorter = [clone(case.policy(), demonstrations, case.task, wild, found.chosen_step, stream(1)).loss]
     assert found.chosen_step < 12
-    assert shorter == [found.loss]
+    assert clone(case.policy(), demonstrations, case.task, wild, found.chosen_step, stream(1)).loss == found.loss
 
 
 def test_refusals(study, demonstrations, params):

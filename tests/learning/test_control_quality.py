@@ -5,14 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.learning.control_quality import (
-    harris_index,
-    input_figures,
-    integral_errors,
-    quality,
-    settling_time,
-    worst_mean,
-)
+from helpers.learning.control_quality import harris_index, input_figures, integral_errors, quality, settling_time, worst_mean
 from helpers.learning.evaluation import overshoot, rise_time
 from helpers.plant.rollout import rollout, stream
 from helpers.plant.task import Trajectories
@@ -53,26 +46,16 @@ def test_quality_reads_the_mean_response_and_single_ones_of_both_loops(study, ro
     assert expected["overshoot"].max() > 0.01
 
 
-def test_what_is_never_reached_is_undefined():
-    error = 1 - torch.tensor([[0.0, 0.0], [0.5, 0.95], [0.8, 1.2]])
-    assert rise_time(error, DT).isnan().tolist() == [True, False]
-    assert settling_time(error, DT, 0.05).isnan().all()
-    assert overshoot(error).tolist() == [0.0, pytest.approx(0.2)]
-
-
-def test_integral_errors_by_hand():
-    error = torch.tensor([[[1.0]], [[-0.5]], [[0.25]]])
-    found = {name: value.item() for name, value in integral_errors(error, 0.1).items()}
-    assert found == pytest.approx({"ise": 0.1 * 1.3125, "iae": 0.1 * 1.75, "itae": 0.1 * (0.1 + 0.2 * 0.5 + 0.3 * 0.25)})
-
-
-def test_the_worst_are_averaged():
+def test_other_figures_by_hand():
+    never = 1 - torch.tensor([[0.0, 0.0], [0.5, 0.95], [0.8, 1.2]])
+    assert rise_time(never, DT).isnan().tolist() == [True, False]
+    assert settling_time(never, DT, 0.05).isnan().all()
+    assert overshoot(never).tolist() == [0.0, pytest.approx(0.2)]
+    errors = {name: value.item() for name, value in integral_errors(torch.tensor([[[1.0]], [[-0.5]], [[0.25]]]), 0.1).items()}
+    assert errors == pytest.approx({"ise": 0.1 * 1.3125, "iae": 0.1 * 1.75, "itae": 0.1 * (0.1 + 0.2 * 0.5 + 0.3 * 0.25)})
     values = torch.arange(40.0)[torch.randperm(40, generator=stream(0))][:, None]
     assert worst_mean(values, 0.05).tolist() == [38.5]
     assert worst_mean(values[:3], 0.05).item() == values[:3].max().item()
-
-
-def test_input_figures_by_hand():
     u = torch.tensor([[0.0, 1.0], [2.0, 1.0], [-1.0, 1.0]])[:, None]
     batch = Trajectories(torch.zeros(4, 1, 2), torch.zeros(4, 1, 2), u, u)
     found = input_figures(batch, torch.tensor([-1.0, -1.0]), torch.tensor([2.0, 3.0]))

@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.learning.evaluation import (
-    expected_features,
-    feature_gap,
-    objective,
-    relative_gap,
-    scores,
-)
+from helpers.learning.evaluation import expected_features, feature_gap, objective, scores
 from helpers.plant.rollout import rollout, stream
 from helpers.plant.task import Trajectories
 from helpers.settings.paper import load_published
@@ -20,20 +14,17 @@ from helpers.settings.paper import load_published
 F64 = torch.float64
 
 
-def responses(x, u=None):
-    """Trajectories whose states and observations are x, shape (T + 1, K, n)."""
-    x = torch.tensor(x, dtype=F64)
-    u = torch.zeros_like(x[1:]) if u is None else torch.tensor(u, dtype=F64)
-    return Trajectories(x, x, u, u)
-
-
 @pytest.mark.equation("S1")
-def test_expected_features_are_the_mean_over_fresh_episodes(study):
+def test_features_are_means_over_fresh_episodes_and_scores_hold_their_deviations_too(study):
     case = study()
-    found = expected_features(case.process, case.pid, case.features, 30, stream(0, "evaluation"))
     batch = rollout(case.process, case.pid, case.task, 30, stream(0, "evaluation"))
-    v = np.stack([case.features.trajectory(batch)[k].numpy() for k in range(30)])
-    np.testing.assert_allclose(found, v.mean(0), rtol=1e-12)
+    v = case.features.trajectory(batch).numpy()
+    expected = expected_features(case.process, case.pid, case.features, 30, stream(0, "evaluation"))
+    np.testing.assert_allclose(expected, v.mean(0), rtol=1e-12)
+    found = scores(batch, case.features, 30.0, ("C_A", "T"), ("C_A0", "T_E"))
+    names = ("C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III")
+    np.testing.assert_allclose([found[f"v:{name}"] for name in names], v.mean(0), rtol=1e-12)
+    np.testing.assert_allclose([found[f"v:{name}:std"] for name in names], v.std(0, ddof=1), rtol=1e-12)
 
 
 @pytest.mark.parametrize("case", [1, 2, 3])
@@ -42,23 +33,6 @@ def test_expert_rows_of_the_published_tables(study, root, case):
     example, published = study(case), torch.tensor(load_published(root)[case].expert, dtype=F64)
     found = expected_features(example.process, example.pid, example.features, 20_000, stream(0, "expert", case))
     assert feature_gap(found, published) <= 0.03
-
-
-def test_scores_hold_mean_and_deviation_of_every_feature(study):
-    case = study()
-    batch = rollout(case.process, case.pid, case.task, 40, stream(0, "scores"))
-    found = scores(batch, case.features, 30.0, ("C_A", "T"), ("C_A0", "T_E"))
-    v = case.features.trajectory(batch).numpy()
-    names = ("C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III")
-    np.testing.assert_allclose([found[f"v:{name}"] for name in names], v.mean(0), rtol=1e-12)
-    np.testing.assert_allclose([found[f"v:{name}:std"] for name in names], v.std(0, ddof=1), rtol=1e-12)
-
-
-def test_relative_gap_is_counted_in_units_of_the_experts_size():
-    expert, policy = torch.tensor([20.0, -10.0], dtype=F64), torch.tensor([15.0, -12.0], dtype=F64)
-    np.testing.assert_allclose(relative_gap(policy, expert), [0.25, 0.2], rtol=1e-14)
-    assert feature_gap(policy, expert) == pytest.approx(0.225, rel=1e-13)
-    assert feature_gap(expert, expert) == 0
 
 
 @pytest.mark.parametrize(("case", "gap"), [(1, 0.037), (2, 0.137), (3, 0.115)])
@@ -85,11 +59,10 @@ def test_figures_of_the_mean_response_by_hand(study):
     """Set points -1, 4. Mean of two trajectories: 10 % at sample 1, 90 % at 3, then past -1 by 0.2; at 1 and 5, past 4 by 0.4."""
     c_a = np.array([0.0, -0.15, -0.5, -0.95, -1.2, -0.9, -0.7])
     t = np.array([0.0, 3.0, 3.2, 3.4, 3.4, 4.4, 4.4])
-    u = np.array([[[0.0, 5.0], [1.0, 1.0]], [[2.0, 5.0], [1.0, -1.0]], [[-1.0, 5.0], [1.0, 1.0]]])
-    u = np.concatenate([u, np.repeat(u[-1:], 3, axis=0)])
+    u = torch.tensor([[[0.0, 5.0], [1.0, 1.0]], [[2.0, 5.0], [1.0, -1.0]], *[[[-1.0, 5.0], [1.0, 1.0]]] * 4], dtype=F64)
     apart = np.array([0.3, -0.3])[:, None] * [1, 0]  # the two trajectories about their mean
-    batch = responses(np.stack([c_a, t], axis=-1)[:, None] + apart, u)
-    found = scores(batch, study().features, 30.0, ("C_A", "T"), ("C_A0", "T_E"), n_last=2)
+    x = torch.tensor(np.stack([c_a, t], axis=-1)[:, None] + apart)
+    found = scores(Trajectories(x, x, u, u), study().features, 30.0, ("C_A", "T"), ("C_A0", "T_E"), n_last=2)
     expected = {"overshoot:C_A": 0.2, "overshoot:T": 0.1, "offset:C_A": 0.2, "offset:T": -0.1}
     expected |= {"rise_time:C_A": 2 * 0.04, "rise_time:T": 4 * 0.04, "movement:C_A0": (5 + 0) / 2, "movement:T_E": (0 + 4) / 2}
     assert {name: found[name] for name in expected} == pytest.approx(expected, rel=1e-12)

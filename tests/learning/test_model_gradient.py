@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from helpers.learning.learner import TrainingError
 from helpers.learning.model_gradient import PATIENCE, Descent, differentiable, model_gradient
-from helpers.learning.tracking_policy import Gains, TrackingPolicy
 from helpers.own_plant.tank import example
 from helpers.plant.rollout import stream
-from helpers.plant.tracking import Bounds, Scenarios, track
+from helpers.plant.tracking import Scenarios, track
+from tests.learning.test_tracking_policy import bounds, episodes, fresh
 
 ONE = Descent(steps=1, longest=torch.inf, price=0.0, price_step=0.0)
 
@@ -21,27 +22,12 @@ def case(study):
     return study()
 
 
-def bounds(case):
-    return Bounds(case.task.input_low, case.task.input_high, torch.full_like(case.task.input_low, torch.inf))
-
-
-def fresh(case):
-    """A policy with a random output layer."""
-    torch.manual_seed(0)
-    unit = case.task.error_scale.abs()
-    gains = Gains(*(torch.tensor(values, dtype=case.dtype).diag() for values in ([4.0, 5.0], [0.5, 1.0], [0.1, 0.2])))
-    policy = TrackingPolicy(case.params.learning.policy, gains, unit, case.task.set_point, unit, bounds(case))
-    with torch.no_grad():
-        policy.output.weight.normal_(std=0.1)
-    return policy
-
-
-def episodes(case, n, n_steps, set_point, load=0.0):
-    generator = stream(0, "episodes")
-    shapes = (1, n, 2), (n_steps, n, case.process.n_disturbances), (n_steps + 1, n, 2)
-    start, w, v = (torch.randn(shape, generator=generator, dtype=case.dtype) for shape in shapes)
-    target = torch.tensor(set_point, dtype=case.dtype).expand(n_steps, n, 2)
-    return Scenarios(case.process, target, torch.zeros_like(v[1:]) + load, 0.1 * start[0], 0 * start[0], w, v)
+def start(case, n, n_steps, set_point=(-0.2, 0.5), **changes):
+    """A policy with random weights in its output layer and small gains, and episodes with noise."""
+    target = torch.tensor(set_point, dtype=case.dtype).expand(n_steps, 2)
+    policy = fresh(case, 0, parts=([4.0, 5.0], [0.5, 1.0], [0.1, 0.2]))
+    torch.nn.init.zeros_(policy.output.bias)
+    return policy, episodes(case, target, n=n, noise=1.0, start=0.1, **changes)
 
 
 def squared(scenarios, run):
@@ -51,20 +37,17 @@ def squared(scenarios, run):
 
 
 def test_the_gradient_is_that_of_finite_differences(case):
-    policy, drawn = fresh(case), episodes(case, 4, 8, [-0.2, 0.5])
-    before = {name: value.clone() for name, value in policy.state_dict().items()}
+    policy, drawn = start(case, 4, 8)
+    before = parameters_to_vector(policy.parameters()).detach()
     model_gradient(policy, lambda: drawn, squared, bounds(case), ONE)
-    gradient = {name: parameter.grad for name, parameter in policy.named_parameters()}
+    gradient = parameters_to_vector([parameter.grad for parameter in policy.parameters()])
     for seed in range(4):
-        generator = stream(seed, "direction")
-        way = {name: torch.randn(value.shape, generator=generator, dtype=case.dtype) for name, value in gradient.items()}
-        costs = []
+        way, costs = torch.randn(len(before), generator=stream(seed, "direction"), dtype=case.dtype), []
         for length in (1e-6, -1e-6):
-            policy.load_state_dict(before | {name: before[name] + length * step for name, step in way.items()})
+            vector_to_parameters(before + length * way, policy.parameters())
             with torch.no_grad():
                 costs.append(squared(drawn, track(policy, drawn, bounds(case)))[0].mean().item())
-        expected = sum((gradient[name] * step).sum().item() for name, step in way.items())
-        np.testing.assert_allclose((costs[0] - costs[1]) / 2e-6, expected, rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose((costs[0] - costs[1]) / 2e-6, (gradient @ way).item(), rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.equation("3.2.4")
@@ -75,14 +58,13 @@ def test_reinforce_expects_the_same_gradient(case):
     """
     n, sigma = 40_000, 1.5
     noise = torch.randn(1, n, 2, generator=stream(0, "exploration"), dtype=case.dtype)
-    drawn = replace(episodes(case, n, 1, [-0.2, 0.5], load=sigma * noise), start=torch.full((n, 2), 0.1, dtype=case.dtype))
-    policy = fresh(case)
+    policy, drawn = start(case, n, 1, load=sigma * noise)
+    drawn = replace(drawn, start=torch.full((n, 2), 0.1, dtype=case.dtype))
     half = (policy.high - policy.low) / 2  # d mu / d bias of the output layer
     with torch.no_grad():
         run = track(policy, drawn, bounds(case))
         cost = squared(drawn, run)[0]
-    assert (run.u > policy.low).all()
-    assert (run.u < policy.high).all()
+    assert ((run.u > policy.low) & (run.u < policy.high)).all()
     samples = (cost - cost.mean())[:, None] * noise[0] / sigma * half
     model_gradient(policy, lambda: drawn, squared, bounds(case), ONE)
     error = (samples.mean(0) - policy.output.bias.grad).abs()
@@ -97,7 +79,7 @@ def test_the_price_on_movement_rises_while_there_is_too_much_and_falls_after(cas
     def measure(scenarios, run):
         return squared(scenarios, run)[0], run.movement.sum(0).mean(-1) / 8.0
 
-    policy, drawn = fresh(case), episodes(case, 16, 10, [-0.5, 2.0])
+    policy, drawn = start(case, 16, 10, (-0.5, 2.0))
     descent = Descent(steps=120, rate_start=2e-2, price=0.0, price_step=0.2)
     records = model_gradient(policy, lambda: drawn, measure, bounds(case), descent)
     prices, moved = [record.price for record in records], [record.movement for record in records]
@@ -108,7 +90,7 @@ def test_the_price_on_movement_rises_while_there_is_too_much_and_falls_after(cas
 
 
 def test_a_cost_that_stays_not_finite_ends_the_training(case):
-    seen = []
+    seen, (policy, drawn) = [], start(case, 2, 3)
 
     def measure(scenarios, run):
         seen.append(1)
@@ -116,7 +98,7 @@ def test_a_cost_that_stays_not_finite_ends_the_training(case):
         return cost * torch.nan, cost
 
     with pytest.raises(TrainingError, match="is not finite"):
-        model_gradient(fresh(case), lambda: episodes(case, 2, 3, [-0.2, 0.5]), measure, bounds(case), Descent(steps=50))
+        model_gradient(policy, lambda: drawn, measure, bounds(case), Descent(steps=50))
     assert len(seen) == PATIENCE + 1
 
 

@@ -5,9 +5,10 @@ import pytest
 import torch
 from scipy.stats import norm
 
-from helpers.learning.policy import LSTMPolicy, PolicyController, entropy
+from helpers.learning.policy import PolicyController, entropy
 from helpers.plant.rollout import rollout, stream
 from helpers.settings.paper import ExplorationParams
+from tests.plant.test_controllers import run
 
 F64 = torch.float64
 
@@ -90,43 +91,20 @@ def test_fast_stepping_agrees_with_forward_along_whole_trajectories(study, dtype
     policy = stirred(case.policy(), factor)
     batch = episodes(case, policy, n=50)
     controller = PolicyController(policy, case.task, exploring)
-    memory = controller.start(50, 50, stream(0, "replay"))
-    u = torch.empty_like(batch.u)
-    command = torch.empty_like(batch.u)
-    for t in range(50):
-        command[t], memory = controller.act(batch.y[t], memory)
-        u[t] = command[t].clamp(case.task.input_low, case.task.input_high)
+    command, exploration = run(controller, batch.y[:-1]), controller.start(50, 50, stream(0)).exploration
+    u = command.clamp(case.task.input_low, case.task.input_high)
     mean, std = (part.detach() for part in policy(batch.y, u, case.task))
-    expected = mean + std * torch.stack(memory.exploration).mT if exploring else mean
+    expected = mean + std * torch.stack(exploration).mT if exploring else mean
     span = case.task.input_high - case.task.input_low
     assert ((command - expected) / span).abs().max() < tolerance
 
 
-def test_the_mode_has_no_noise_and_exploring_has_the_stated_spread(study):
+def test_exploration_is_standard_normal(study):
     case = study()
-    policy = case.policy()
-    controller = PolicyController(policy, case.task, exploring=True)
-    y = torch.zeros(40_000, 2, dtype=F64)
-    command, _ = controller.act(y, controller.start(len(y), 1, stream(0, "spread")))
-    deployed = PolicyController(policy, case.task, exploring=False)
-    mode, _ = deployed.act(y, deployed.start(len(y), 1, stream(0)))
-    span = case.task.input_high - case.task.input_low
-    assert ((mode - mode[0]).abs() / span).max() < 1e-12  # a product may round one column otherwise than the next
-    share = ((command - mode) / span).numpy()
-    spread = policy.params.initial_std
-    np.testing.assert_array_less(np.abs(share.mean(0)), 5 * spread / np.sqrt(len(y)))
-    np.testing.assert_allclose(share.std(0), spread, rtol=5 / np.sqrt(2 * len(y)))
-
-
-@pytest.mark.equation("3.2.3")
-def test_log_probability_is_that_of_independent_normal_inputs(study):
-    case = study()
-    policy = stirred(case.policy())
-    batch = episodes(case, policy)
-    found = policy.log_probability(batch.y, batch.u, batch.command, case.task).detach()
-    mean, std = numpy_forward(policy, batch.y, batch.u, case.task)
-    np.testing.assert_allclose(found, norm.logpdf(batch.command.numpy(), mean, std).sum(-1), rtol=0, atol=1e-9)
-    assert found.shape == (50, 7)
+    memory = PolicyController(case.policy(), case.task, exploring=True).start(40_000, 1, stream(0, "spread"))
+    draws = torch.stack(memory.exploration).numpy()
+    np.testing.assert_array_less(np.abs(draws.mean(-1)), 5 / np.sqrt(40_000))
+    np.testing.assert_allclose(draws.std(-1), 1, rtol=5 / np.sqrt(80_000))
 
 
 def test_entropy_is_that_of_inputs_measured_by_their_range(study):
@@ -137,24 +115,26 @@ def test_entropy_is_that_of_inputs_measured_by_their_range(study):
 
 
 @pytest.mark.equation("3.2.3")
-def test_the_gradient_of_the_log_probability_by_finite_differences(study):
-    """Of the density of the commands, written with scipy; the rest of a trajectory's density does not depend on the policy."""
+def test_log_probability_and_its_gradient_are_those_of_independent_normal_inputs(study):
+    """Written with scipy, the gradient by finite differences; the rest of a trajectory's density does not depend on the policy."""
     case = study()
     policy = case.policy(leaky_slope=0.3)
-    batch = episodes(case, policy, n=1)
+    batch = episodes(case, policy)
 
     def log_density():
         mean, std = numpy_forward(policy, batch.y, batch.u, case.task)
-        return norm.logpdf(batch.command.numpy(), mean, std).sum()
+        return norm.logpdf(batch.command.numpy(), mean, std).sum(-1)
 
-    policy.log_probability(batch.y, batch.u, batch.command, case.task).sum().backward()
+    found = policy.log_probability(batch.y, batch.u, batch.command, case.task)
+    np.testing.assert_allclose(found.detach(), log_density(), rtol=0, atol=1e-9)
+    found.sum().backward()
     for parameter in policy.parameters():
         values, gradient = parameter.detach().view(-1), parameter.grad.view(-1)
         for index in (0, len(values) // 2, int(gradient.abs().argmax())):
             middle, sides = values[index].item(), []
             for shift in (1e-5, -1e-5):
                 values[index] = middle + shift
-                sides.append(log_density())
+                sides.append(log_density().sum())
             values[index] = middle
             assert (sides[0] - sides[1]) / 2e-5 == pytest.approx(gradient[index].item(), rel=1e-4, abs=1e-4)
 
@@ -163,8 +143,9 @@ def test_the_gradient_of_the_log_probability_by_finite_differences(study):
 def test_a_fresh_policy_asks_for_inputs_near_the_steady_state(study, low, high):
     case = study(process={"input_low": low, "input_high": high})
     span = np.subtract(high, low)
-    for seed in range(5):
-        policy = case.policy(seed)
+    policies = [case.policy(seed) for seed in range(5)]
+    assert len({policy.layers[0].weight_ih_l0[0, 0].item() for policy in policies}) == 5
+    for policy in policies:
         batch = episodes(case, policy, exploring=False, n=20)
         assert (np.abs(batch.command.numpy().mean((0, 1))) / span < 0.1).all()
         _, std = policy(batch.y, batch.u, case.task)
@@ -188,29 +169,3 @@ def test_reset_exploration_restores_the_spread_and_keeps_the_mean(study, limits)
     assert not torch.allclose(before[1], std)
     torch.testing.assert_close(std, (policy.params.initial_std * span).expand_as(std), rtol=1e-12, atol=0)
     assert limits is None or vars(policy.params).items() >= limits.items()
-
-
-def test_episodes_do_not_share_memory(study):
-    case = study()
-    controller = PolicyController(stirred(case.policy()), case.task, exploring=True)
-    first = rollout(case.process, controller, case.task, 5, stream(0, "again"))
-    rollout(case.process, controller, case.task, 9, stream(1, "again"))  # another batch with the same controller object
-    assert torch.equal(first.command, rollout(case.process, controller, case.task, 5, stream(0, "again")).command)
-
-
-def test_fresh_policies_depend_on_the_generator_alone(study):
-    case = study()
-    torch.manual_seed(1)
-    first = case.policy(3).state_dict()
-    torch.manual_seed(2)
-    second = case.policy(3).state_dict()
-    other = case.policy(4).state_dict()
-    assert all(torch.equal(first[name], second[name]) for name in first)
-    assert not torch.equal(first["layers.0.weight_ih_l0"], other["layers.0.weight_ih_l0"])
-
-
-def test_the_paper_network_has_two_layers_of_twenty_cells(study):
-    policy = study().policy()
-    assert isinstance(policy, LSTMPolicy)
-    assert [layer.hidden_size for layer in policy.layers] == [20, 20]
-    assert policy.output.out_features == 4

@@ -31,72 +31,52 @@ def paper_pid(case, parts):
     return PID(GainParams.model_construct(proportional=parts[0], integral=integral, derivative=parts[2]), case.task.set_point, dt)
 
 
-def bounds(case, wider=1.0):
-    infinite = torch.full_like(case.task.input_low, torch.inf)
-    return Bounds(wider * case.task.input_low, wider * case.task.input_high, infinite)
+def bounds(case):
+    return Bounds(case.task.input_low, case.task.input_high, torch.full_like(case.task.input_low, torch.inf))
 
 
-def tracking_pid(case, parts=PARTS, wider=1.0):
-    return TrackingPID(gains(parts), bounds(case, wider))
+def tracking_pid(case, parts=PARTS):
+    return TrackingPID(gains(parts), bounds(case))
 
 
-def fresh(case, seed=None, kept=None):
+def fresh(case, seed=None, kept=None, parts=PARTS):
     """A policy whose output layer is zero, or random with a seed; `kept`: of the patient form."""
     torch.manual_seed(0 if seed is None else seed)
     unit = case.task.error_scale.abs()
-    policy = TrackingPolicy(case.params.learning.policy, gains(), unit, case.task.set_point, unit, bounds(case), kept)
+    policy = TrackingPolicy(case.params.learning.policy, gains(parts), unit, case.task.set_point, unit, bounds(case), kept)
     if seed is not None:
-        with torch.no_grad():
-            for parameter in policy.output.parameters():
-                parameter.normal_(std=0.1)
+        for parameter in policy.output.parameters():
+            torch.nn.init.normal_(parameter, std=0.1)
     return policy
 
 
-def episodes(case, set_point, load=0.0, n=3):
-    """Episodes without noise from several states; set points (T, 2)."""
-    n_steps = len(set_point)
-    generator = stream(0, "episodes")
-    zero = torch.zeros(n_steps + 1, n, 2, dtype=case.dtype)
-    start = 0.3 * torch.randn(n, 2, generator=generator, dtype=case.dtype)
-    return Scenarios(
-        case.process, set_point[:, None].expand(-1, n, -1), zero[1:] + load, start, zero[0], zero[1:].repeat(1, 1, 4), zero
-    )
+def episodes(case, set_point, load=0.0, n=3, noise=0.0, start=0.3):
+    """Episodes from several states, `noise`: the size of what is drawn; set points (T, 2)."""
+    generator, n_steps = stream(0, "episodes"), len(set_point)
+    shapes = (n, 2), (n_steps, n, case.process.n_disturbances), (n_steps + 1, n, 2)
+    first, w, v = (torch.randn(shape, generator=generator, dtype=case.dtype) for shape in shapes)
+    target = set_point[:, None].expand(-1, n, -1)
+    return Scenarios(case.process, target, torch.zeros_like(target) + load, start * first, 0 * first, noise * w, noise * v)
 
 
 def test_with_an_output_layer_of_zero_it_is_the_pid(study):
-    case, policy = study(), None
-    policy = fresh(case)
-    drawn = episodes(case, case.task.set_point.expand(40, 2))
-    noise = torch.randn(41, 3, 2, generator=stream(1, "noise"), dtype=case.dtype)
-    drawn = replace(drawn, noise=noise, disturbance=noise[1:].repeat(1, 1, 4))
+    case = study()
+    policy, drawn = fresh(case), episodes(case, case.task.set_point.expand(40, 2), noise=1.0)
     found, expected = (track(tracker, drawn, bounds(case)) for tracker in (policy, tracking_pid(case)))
     torch.testing.assert_close(found.u, expected.u, rtol=1e-10, atol=1e-10)
     for found_part, part in zip(vars(policy.gains).values(), vars(gains()).values(), strict=True):
         torch.testing.assert_close(found_part, part)
 
 
-def test_away_from_the_bounds_it_is_the_pid_of_the_paper(study):
-    """Without derivative action: at the first sample the paper's PID has none, and the form in increments has."""
-    case = study(process={"input_low": (-1e4, -1e4), "input_high": (1e4, 1e4)})
-    parts = (PARTS[0], PARTS[1], [0.0, 0.0])
-    runs = [
-        rollout(case.process, controller, case.task, 4, stream(0, "episodes"))
-        for controller in (AtSetPoint(tracking_pid(case, parts), case.task), paper_pid(case, parts))
-    ]
-    torch.testing.assert_close(runs[0].u, runs[1].u, rtol=1e-9, atol=1e-9)
-
-
-def test_what_keeps_all_that_a_bound_cuts_off_is_the_pid_of_the_paper(study):
-    """Which goes on integrating at a bound."""
-    case = study()
-    with torch.no_grad():
-        policy = fresh(case, kept=1 - 1e-13)
-        policy.derivative.zero_()
-        runs = [
-            rollout(case.process, controller, case.task, 4, stream(0, "episodes")).u
-            for controller in (AtSetPoint(policy, case.task), paper_pid(case, (PARTS[0], PARTS[1], [0.0, 0.0])))
-        ]
-    torch.testing.assert_close(*runs, rtol=1e-7, atol=1e-7)
+def test_where_nothing_is_cut_off_or_all_of_it_kept_it_is_the_pid_of_the_paper(study):
+    """Which goes on integrating at a bound. Without derivative action: at the first sample the paper's PID has none."""
+    case, wide, parts = study(), study(process={"input_low": (-1e4, -1e4), "input_high": (1e4, 1e4)}), (*PARTS[:2], [0.0, 0.0])
+    patient = fresh(case, kept=1 - 1e-13, parts=parts)
+    for each, tracker, tolerance in ((wide, tracking_pid(wide, parts), 1e-9), (case, patient, 1e-7)):
+        controllers = AtSetPoint(tracker, each.task), paper_pid(each, parts)
+        with torch.no_grad():
+            runs = [rollout(each.process, controller, each.task, 4, stream(0, "episodes")).u for controller in controllers]
+        torch.testing.assert_close(*runs, rtol=tolerance, atol=tolerance)
 
 
 def test_the_input_that_was_applied_counts(case):

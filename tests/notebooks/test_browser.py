@@ -51,14 +51,9 @@ def lab(tmp_path_factory):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    options = [f"--ServerApp.root_dir={root}", f"--ServerApp.port={port}", "--IdentityProvider.token="]
-    options += [
-        "--no-browser",
-        "--allow-root",
-        "--LabApp.expose_app_in_browser=True",
-        f"--LabApp.user_settings_dir={root / 'settings'}",
-    ]
-    options += [f"--LabApp.workspaces_dir={root / 'workspaces'}"]
+    options = ["--no-browser", "--allow-root", "--LabApp.expose_app_in_browser=True", "--IdentityProvider.token="]
+    options += [f"--ServerApp.root_dir={root}", f"--ServerApp.port={port}"]
+    options += [f"--LabApp.user_settings_dir={root / 'settings'}", f"--LabApp.workspaces_dir={root / 'workspaces'}"]
     environment = os.environ | {"PYTHONPATH": str(root / "src"), "JUPYTER_RUNTIME_DIR": str(root / "runtime")}
     environment.pop("MPLBACKEND", None)
     with (root / "log.txt").open("w", encoding="utf-8") as log:

@@ -9,6 +9,10 @@ from helpers.settings.leaf import InputError
 from tests.own_plant.plants import HOLD, HORIZON, MadeUpPlant
 
 CYCLES = 15
+ONE, TWO = MadeUpPlant(1, 1, CYCLES), MadeUpPlant(2, 2, CYCLES)
+GAPS = ONE.table[~(ONE.table.index % HOLD).isin(range(5, 15))]
+STILL = ONE.table.assign(**{"Y0.SP": 50.0})  # its set point never moves
+REST, GOAL = (f"{value:g}" for value in (ONE.steady_y[0], ONE.steady_y[0] + ONE.set_point[0]))
 
 
 @pytest.fixture
@@ -37,65 +41,49 @@ def test_episodes_begin_at_the_steps_to_the_task_s_set_point(cut):
 
 
 def test_episodes_that_a_gap_an_operator_or_a_new_set_point_spoils_do_not_count(cut):
-    plant = MadeUpPlant(2, 2, CYCLES)
-    table = plant.table.copy()
+    table = TWO.table.copy()
     table.loc[HOLD + 4, "MODE"] = "MAN"
-    table.loc[3 * HOLD + 5 : 3 * HOLD + 30, "Y0.SP"] = plant.steady_y[0] - 2
-    table = table.drop(index=range(5 * HOLD + 3, 5 * HOLD + 11))
-    _, _, found = cut(plant, table)
+    table.loc[3 * HOLD + 5 : 3 * HOLD + 30, "Y0.SP"] = TWO.steady_y[0] - 2
+    _, _, found = cut(TWO, table.drop(index=range(5 * HOLD + 3, 5 * HOLD + 11)))
     assert found.left_out == {"cut short by a break": 1, "not in automatic": 1, "set point moved again": 1}
     assert found.trajectories.n_trajectories == CYCLES - 3
 
 
-def test_too_few_episodes_are_refused_with_the_reasons(cut):
-    plant = MadeUpPlant(2, 2, CYCLES)
-    with pytest.raises(InputError, match=r"plant\.csv: 0 episodes of 12 samples .* expected 10 or more; left out: 15 cut short"):
-        cut(plant, plant.table[(plant.table.index % HOLD < 5) | (plant.table.index % HOLD > 14)])
-    with pytest.raises(InputError, match=r"plant\.csv: 0 episodes of 100 samples .* left out: 1 cut short"):
-        cut(plant, plant.table.iloc[: 2 * HOLD], horizon=100)  # a record shorter than an episode
+def loop(**changes):
+    """The one loop described otherwise."""
+    return {"controlled": [{key: value for key, value in (ONE.content["controlled"][0] | changes).items() if value is not None}]}
 
 
-def loop(plant, **changes):
-    return [{key: value for key, value in (plant.content["controlled"][0] | changes).items() if value is not None}]
+@pytest.mark.parametrize(
+    ("table", "changes", "says"),
+    [
+        (GAPS, {}, "0 episodes of 12 samples .* expected 10 or more; left out: 15 cut short"),
+        (ONE.table.iloc[: 2 * HOLD], {"horizon": 100}, "0 episodes of 100 samples .* left out: 1 cut short"),  # a short record
+        (ONE.table, loop(set_point=80.0), f"'Y0.SP': the set points lie between {REST} and {GOAL}, none is .* 80 %: change"),
+        (ONE.table, loop(set_point=80.0, set_point_tag=None), "'Y0.PV': lies between 49.* never near the set point, .* 80 %"),
+        (ONE.table, loop(steady_state=40.0), f"0 episodes .* left out: .* {CYCLES} not from 'steady_state'"),
+        (STILL, {}, "'Y0.SP': the set points stay at 50, none is .*: change 'set_point' of 'y0', .*'error_scale'"),
+        (STILL, loop(set_point=50.0), "give 'error_scale'"),
+        (STILL, loop(set_point=50.0, steady_state=48.0) | {"horizon": 99}, "6 episodes of 99 samples at the set point of the task"),
+    ],
+)
+def test_a_record_without_the_task_is_refused_with_the_reason(cut, table, changes, says):
+    with pytest.raises(InputError, match=rf"plant\.\w+: .*{says}"):
+        cut(ONE, table, **changes)
 
 
-def test_a_record_that_never_comes_near_the_task_is_refused_with_the_range_that_it_has(cut):
-    plant = MadeUpPlant(1, 1, CYCLES)
-    low, high = (f"{value:g}" for value in (plant.steady_y[0], plant.steady_y[0] + plant.set_point[0]))
-    for changes, says in (
-        (
-            {"set_point": 80.0},
-            rf"'Y0\.SP': the set points lie between {low} and {high}, none is .* 80 %: change 'set_point' of 'y0'",
-        ),
-        ({"set_point": 80.0, "set_point_tag": None}, r"'Y0\.PV': lies between 49.* never near the set point, .* 80 %: change"),
-        ({"steady_state": 40.0}, rf"0 episodes .* left out: .* {CYCLES} not from 'steady_state'"),
-    ):
-        with pytest.raises(InputError, match=rf"plant\.csv: .*{says}"):
-            cut(plant, controlled=loop(plant, **changes))
-
-
-def test_a_record_whose_set_point_never_moves_gives_stretches_or_says_where_it_stays(cut):
-    plant = MadeUpPlant(1, 1, CYCLES)
-    table = plant.table.assign(**{"Y0.SP": 50.0})
-    says = r"'Y0\.SP': the set points stay at 50, none is .*: change 'set_point' of 'y0', .*'error_scale'"
-    with pytest.raises(InputError, match=says):
-        cut(plant, table)
-    for still in ({"steady_state": 48.0}, {"error_scale": 0.5}):
-        _, _, found = cut(plant, table, controlled=loop(plant, set_point=50.0, **still))
-        assert found.trajectories.n_trajectories == 2 * HOLD * CYCLES // (HORIZON + 1)
-    with pytest.raises(InputError, match="give 'error_scale'"):
-        cut(plant, table, controlled=loop(plant, set_point=50.0))
-    with pytest.raises(InputError, match=r"6 episodes of 99 samples at the set point of the task, expected 10"):
-        cut(plant, table, controlled=loop(plant, set_point=50.0, steady_state=48.0), horizon=99)
+@pytest.mark.parametrize("still", [{"steady_state": 48.0}, {"error_scale": 0.5}])
+def test_a_record_whose_set_point_never_moves_gives_stretches(cut, still):
+    _, _, found = cut(ONE, STILL, **loop(set_point=50.0, **still))
+    assert found.trajectories.n_trajectories == 2 * HOLD * CYCLES // (HORIZON + 1)
 
 
 def test_after_a_break_the_input_before_is_the_first_of_the_episode(cut):
-    plant = MadeUpPlant(1, 1, CYCLES)
-    table = plant.table.assign(**{"Y0.SP": 50.0})
+    table = STILL.copy()
     table.loc[100:129, "U0.OP"] = np.nan
-    _, _, found = cut(plant, table, controlled=loop(plant, set_point=50.0, error_scale=0.5))
+    _, _, found = cut(ONE, table, **loop(set_point=50.0, error_scale=0.5))
     assert found.before.isfinite().all()
-    inputs = table["U0.OP"].to_numpy() - plant.steady_u
+    inputs = table["U0.OP"].to_numpy() - ONE.steady_u
     episode = found.starts.index(130 + 2)
     assert found.before[episode].item() == pytest.approx(inputs[130])
     assert found.before[episode + 1].item() == pytest.approx(inputs[130 + HORIZON])
@@ -103,10 +91,9 @@ def test_after_a_break_the_input_before_is_the_first_of_the_episode(cut):
 
 
 def test_stretches_hold_every_usable_row_in_deviation_variables(cut):
-    plant = MadeUpPlant(2, 2, CYCLES)
-    clean, description, _ = cut(plant, plant.table.drop(index=range(100, 110)))
+    clean, description, _ = cut(TWO, TWO.table.drop(index=range(100, 110)))
     pieces = stretches(clean, description, 10)
-    assert [len(piece) for piece in pieces] == [100, len(plant.table) - 110]
-    assert pieces[1].y[0] == pytest.approx(plant.table.loc[110, ["Y0.PV", "Y1.PV"]].to_numpy(dtype=float) - plant.steady_y)
+    assert [len(piece) for piece in pieces] == [100, len(TWO.table) - 110]
+    assert pieces[1].y[0] == pytest.approx(TWO.table.loc[110, ["Y0.PV", "Y1.PV"]].to_numpy(dtype=float) - TWO.steady_y)
     assert len(stretches(clean, description, 101)) == 1
     assert np.isfinite(pieces[0].u).all()

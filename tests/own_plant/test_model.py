@@ -12,24 +12,12 @@ from helpers.own_plant.model import load_plant
 from helpers.plant.rollout import rollout
 from helpers.settings.leaf import InputError
 from tests.own_plant.plants import MadeUpPlant
+from tests.plant.test_rollout import Constant
 
 
 @pytest.fixture
 def description(tmp_path):
     return load_description(MadeUpPlant(1, 2, n_cycles=1).write(tmp_path))
-
-
-class Hold:
-    """A controller that asks for the same input always."""
-
-    def __init__(self, command):
-        self.command = command
-
-    def start(self, n_trajectories, n_steps, generator):
-        return None
-
-    def act(self, observation, memory):
-        return self.command.expand(len(observation), -1), memory
 
 
 class Own:
@@ -55,8 +43,8 @@ def own(monkeypatch):
 
 def test_a_class_of_one_s_own_is_found_by_its_import_path(own, description):
     plant = load_plant("own_module:Own", description)
-    task = description.task(torch.zeros(2), torch.zeros(2), torch.float32)
-    batch = rollout(plant, Hold(torch.tensor([0.5, 1.0])), task, 3, torch.Generator())
+    task = description.task(torch.zeros(2), torch.zeros(2), torch.float64)
+    batch = rollout(plant, Constant([0.5, 1.0]), task, 3, torch.Generator())
     assert batch.y[:3, 0, 0].tolist() == [0.0, 0.5, 1.0]
 
 
@@ -75,17 +63,19 @@ def test_a_class_that_does_not_fit_is_refused(own, description, changes, says):
         load_plant("own_module:Own", description)
 
 
-def test_what_cannot_be_imported_is_refused(description):
-    for name in ("no_such_module:Plant", "helpers.own_plant.model:Nothing", "helpers.own_plant.model"):
-        with pytest.raises(InputError, match=r"expected package\.module:Class"):
-            load_plant(name, description)
+NO_CLASS, NO_ENVIRONMENT = r"expected package\.module:Class", "plant 'gymnasium:.*': it cannot be made: "
 
 
-@pytest.mark.parametrize("name", ["NoSuch-v0", "CartPole-v999", "no_such_module:Env-v0", ""])
-def test_an_environment_that_cannot_be_made_is_refused(description, name):
-    pytest.importorskip("gymnasium")
-    with pytest.raises(InputError, match=f"plant 'gymnasium:{name}': it cannot be made: "):
-        load_plant(f"gymnasium:{name}", description)
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [(name, NO_CLASS) for name in ("no_such_module:Plant", "helpers.own_plant.model:Nothing", "helpers.own_plant.model")]
+    + [(f"gymnasium:{name}", NO_ENVIRONMENT) for name in ("NoSuch-v0", "CartPole-v999", "no_such_module:Env-v0", "")],
+)
+def test_what_cannot_be_imported_or_made_is_refused(description, name, says):
+    if name.startswith("gymnasium"):
+        pytest.importorskip("gymnasium")
+    with pytest.raises(InputError, match=says):
+        load_plant(name, description)
 
 
 def test_a_gymnasium_environment_runs_in_engineering_units(description):
@@ -107,8 +97,7 @@ def test_a_gymnasium_environment_runs_in_engineering_units(description):
     gymnasium.register("Made/Up-v0", entry_point=Environment, disable_env_checker=True)
     plant = load_plant("gymnasium:Made/Up-v0", description)
     task = description.task(torch.zeros(1), torch.zeros(1), torch.float64)
-    held = Hold(torch.tensor([1.0, 2.0], dtype=torch.float64))
-    first, second = (rollout(plant, held, task, 4, torch.Generator().manual_seed(0)) for _ in range(2))
+    first, second = (rollout(plant, Constant([1.0, 2.0]), task, 4, torch.Generator().manual_seed(0)) for _ in range(2))
     assert first.y[0].std() > 0.1
     assert torch.equal(first.y, second.y)
     # The inputs rest at 20 and 21; with deviations of 1 and 2 the output rises by 0.3 a sample.

@@ -43,10 +43,6 @@ def pid(proportional, integral):
     return Gains(torch.tensor([[proportional]]), torch.tensor([[integral]]), torch.zeros(1, 1))
 
 
-def price(error, movement):
-    return error.mean(-1)
-
-
 def test_scenarios_start_at_rest_and_can_be_held(operation, params):
     drawn = scenarios(operation, params, quiet=True)
     still = track(TrackingPID(pid(0.0, 0.0), operation.bounds), drawn, operation.bounds)
@@ -72,7 +68,7 @@ def test_the_simc_rule_is_that_of_the_literature():
 
 def test_the_re_tuned_pid_is_better_than_the_record_s_on_all_models(operation, params):
     drawn, record = scenarios(operation, params), pid(0.5, 0.05)
-    tuned = tuned_pid(models(1, 0.0), drawn, record, operation, price, params.rivals, seed=0)
+    tuned = tuned_pid(models(1, 0.0), drawn, record, operation, lambda error, movement: error.mean(-1), params.rivals, seed=0)
     errors = [
         operation.error(track(TrackingPID(gains, operation.bounds), drawn, operation.bounds)).mean() for gains in (record, tuned)
     ]
@@ -82,50 +78,55 @@ def test_the_re_tuned_pid_is_better_than_the_record_s_on_all_models(operation, p
 
 def test_predictive_control_leaves_no_offset_where_its_model_is_wrong(operation, params):
     noisy, quiet = (scenarios(operation, params, still, gain=0.4) for still in (False, True))
-    control = tuned_predictive(models(1, 0.0), noisy, operation, price, params.rivals)
+    control = tuned_predictive(models(1, 0.0), noisy, operation, lambda error, movement: error.mean(-1), params.rivals)
     assert isinstance(control, PredictiveControl)
     run = track(control, quiet, operation.bounds)
     assert run.error[-1].abs().max() < 0.05
     assert operation.error(track(control, noisy, operation.bounds)).mean() < 0.05 + 0.2
 
 
-def test_the_gate_releases_what_is_better_and_nothing_else(operation, params):
-    noisy, quiet = (scenarios(operation, params, still) for still in (False, True))
-    slow, good = TrackingPID(pid(0.5, 0.05), operation.bounds), TrackingPID(pid(1.5, 0.12), operation.bounds)
+@pytest.fixture
+def verdict(operation, params):
+    """Whether a PID of these gains may take the place of the record's, on models as drawn and others at the ends of the margins."""
 
-    def verdict(policy, allowed, **others):
-        one_each = params.gate.model_copy(update={"episodes": 1, "corner_episodes": 8})
-        return judge({RECORD: slow, **others, POLICY: policy}, (noisy, quiet, noisy), operation, allowed, one_each)
+    def judged(gains, others=None, allowed=10.0, corner_episodes=8, ends=None, **changes):
+        noisy, quiet = (scenarios(operation, params, still, **changes) for still in (False, True))
+        corners = scenarios(operation, params, **changes | ends) if ends else noisy
+        controllers = {RECORD: pid(0.5, 0.05), **(others or {}), POLICY: gains}
+        trackers = {name: TrackingPID(each, operation.bounds) for name, each in controllers.items()}
+        settings = params.gate.model_copy(update={"episodes": 1, "corner_episodes": corner_episodes})
+        return judge(trackers, (noisy, quiet, corners), operation, allowed, settings)
 
-    better = verdict(good, 10.0)
+    return judged
+
+
+def test_the_gate_releases_what_is_better_and_nothing_else(verdict):
+    good = pid(1.5, 0.12)
+    better = verdict(good)
     assert better.released
     assert better.keep == POLICY
     assert better.words.startswith("verdict: release the policy: on models held out its mean |e| is ")
     assert len(better.models) == 32
-    assert not verdict(good, 0.5).released
-    assert "times as much" in verdict(good, 0.5).words
-    worse = verdict(TrackingPID(pid(0.2, 0.02), operation.bounds), 10.0)
-    assert worse.words.startswith("verdict: keep the PID: the policy is not released: it is better on only ")
-    drifting = verdict(TrackingPID(pid(3.0, 0.0), operation.bounds), 10.0)
-    assert "it leaves an offset of" in drifting.words
-    as_good = verdict(good, 10.0, **{TUNED: good})
+    as_good = verdict(good, {TUNED: good})
     assert as_good.released
     assert as_good.keep == TUNED
     assert f"but {TUNED} is as good and simpler" in as_good.words
 
 
-def test_a_controller_that_fails_at_an_end_of_the_margins_is_not_released(operation, params):
+def test_the_gate_says_why_it_keeps_the_pid(verdict):
+    moving, worse, drifting = verdict(pid(1.5, 0.12), allowed=0.5), verdict(pid(0.2, 0.02)), verdict(pid(3.0, 0.0))
+    assert not moving.released
+    assert "times as much" in moving.words
+    assert worse.words.startswith("verdict: keep the PID: the policy is not released: it is better on only ")
+    assert "it leaves an offset of" in drifting.words
+
+
+def test_a_controller_that_fails_at_an_end_of_the_margins_is_not_released(verdict):
     """A gain that suits the model, and not one of almost twice its gain; what counts is the mean of an end's episodes."""
-    noisy, quiet = (scenarios(operation, params, still, n_models=32, gain=0.0) for still in (False, True))
-    corners = scenarios(operation, params, n_models=32, gain=0.9)
-    slow, hot = TrackingPID(pid(0.5, 0.05), operation.bounds), TrackingPID(pid(6.0, 0.3), operation.bounds)
-
-    def verdict(third, corner_episodes):
-        settings = params.gate.model_copy(update={"episodes": 1, "corner_episodes": corner_episodes})
-        return judge({RECORD: slow, POLICY: hot}, (noisy, quiet, third), operation, 100.0, settings)
-
-    assert verdict(noisy, 8).released
-    assert not verdict(corners, 8).released
-    assert "at an end of the margins its mean |e| is" in verdict(corners, 8).words
-    worst = [verdict(corners, each).table.loc[POLICY, "worst corner"] for each in (2, 8, 32)]
+    hot, given = pid(6.0, 0.3), {"allowed": 100.0, "n_models": 32, "gain": 0.0}
+    assert verdict(hot, **given).released
+    at_ends = [verdict(hot, corner_episodes=each, ends={"gain": 0.9}, **given) for each in (2, 8, 32)]
+    assert not at_ends[1].released
+    assert "at an end of the margins its mean |e| is" in at_ends[1].words
+    worst = [found.table.loc[POLICY, "worst corner"] for found in at_ends]
     assert worst[0] > worst[1] > worst[2]

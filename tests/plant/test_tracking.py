@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from helpers.learning.tracking_policy import Gains, TrackingPID
 from helpers.plant.rollout import rollout, stream
-from helpers.plant.tracking import AtSetPoint, Bounds, Scenarios, track
+from helpers.plant.tracking import AtSetPoint, Scenarios, track
+from tests.learning.test_tracking_policy import bounds, tracking_pid
 
 N, T = 5, 12
 
@@ -27,13 +27,12 @@ class Constant:
 
 @pytest.fixture
 def case(study):
-    return study(process={"horizon": T})
+    return study(process={"horizon": T}, case_study={"initial_mean": (1.0, -2.0)})
 
 
 @pytest.fixture
 def pid(case):
-    gains = Gains(*(torch.tensor(gains, dtype=case.dtype).diag() for gains in ([9.0, 8.0], [1.0, 3.0], [0.5, 0.2])))
-    return TrackingPID(gains, bounds(case))
+    return tracking_pid(case, ([9.0, 8.0], [1.0, 3.0], [0.5, 0.2]))
 
 
 @pytest.fixture
@@ -46,10 +45,6 @@ def scenarios(case):
     zero = torch.zeros(T, N, 2, dtype=case.dtype)
     first = case.task.initial_mean + case.task.initial_std * start[0]
     return Scenarios(case.process, case.task.set_point.expand(T, N, 2), zero, first, zero[0], disturbance, noise)
-
-
-def bounds(case, rate=torch.inf):
-    return Bounds(case.task.input_low, case.task.input_high, torch.full((2,), rate, dtype=case.dtype))
 
 
 def test_at_a_set_point_that_stands_still_the_loop_is_that_of_the_paper(case, pid, scenarios):
@@ -68,7 +63,7 @@ def test_error_and_movement_are_what_they_say(case, pid, scenarios):
 
 
 def test_the_input_keeps_its_bounds_and_its_rate(case, scenarios):
-    run = track(Constant([1e3, -1e3]), scenarios, bounds(case, rate=4.0))
+    run = track(Constant([1e3, -1e3]), scenarios, bounds(case)._replace(rate=torch.full((2,), 4.0, dtype=case.dtype)))
     assert run.movement.max() <= 4.0 + 1e-12
     torch.testing.assert_close(run.u[:, 0, 0], torch.arange(1, T + 1, dtype=case.dtype).mul(4.0).clamp(max=20.0))
     assert torch.equal(run.u.amin((0, 1))[1], torch.tensor(-48.0, dtype=case.dtype))

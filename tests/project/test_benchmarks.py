@@ -3,6 +3,7 @@
 import json
 import platform
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -25,9 +26,6 @@ FIRST_COLUMNS = ["what", "threads", "K", "T", "steps_per_s", "ratio_to_bound"]
 @pytest.fixture(scope="module")
 def workload(root):
     return Workload.of(root)
-
-
-# The arithmetic
 
 
 def test_the_bound_counts_what_a_learnt_step_cannot_do_without(workload):
@@ -80,9 +78,6 @@ def test_exponents_of_time_and_memory_are_fitted_along_both_axes():
     outcome.plt.close(figure)
     assert np.isnan(outcome.fitted_exponent([5, 5], [1.0, 2.0])).all()
     assert np.isnan(outcome.fitted_exponent([5, 6], [0.0, 2.0])).all()
-
-
-# The baselines against the project's own code
 
 
 def shaken(workload, K, T, dtype, credit="reward_to_go"):
@@ -154,11 +149,11 @@ def test_the_environment_is_the_process_with_its_reward(workload, signal):
     xs, ys, us, rewards = [env.x], [env.y], [], []
     for t in range(8):
         action = actions.uniform(-1.5, 1.5, 2)
-        noise = draws.standard_normal((2, 2))  # of the process, then of the observation
+        noise = draws.standard_normal((process.integration_steps + 1, 2))  # of the process, then of the observation
         _, gained, ended, truncated, info = env.step(action)
-        expected = process.step(*(torch.tensor(value)[None] for value in (xs[-1], info["u"], noise[0])))
+        expected = process.step(*(torch.tensor(value)[None] for value in (xs[-1], info["u"], noise[:-1].ravel())))
         np.testing.assert_allclose(info["x"], expected[0], rtol=1e-12)
-        np.testing.assert_allclose(info["y"], process.observe(expected, torch.tensor(noise[1])[None])[0], rtol=1e-12)
+        np.testing.assert_allclose(info["y"], process.observe(expected, torch.tensor(noise[-1])[None])[0], rtol=1e-12)
         assert (ended, truncated) == (t == 7, False)
         xs, ys, us, rewards = [*xs, info["x"]], [*ys, info["y"]], [*us, info["u"]], [*rewards, gained]
     x, y, u = (torch.tensor(np.array(values))[:, None] for values in (xs, ys, us))
@@ -176,17 +171,9 @@ def test_the_library_learns_with_our_layers_one_batch_a_run(workload):
     assert model.num_timesteps - before == subject.steps == 12
 
 
-# The whole
-
-
 @pytest.mark.torture
-def test_peak_memory_is_that_of_learning_alone():
-    """Without the hundreds of MB that Python and torch take."""
-    assert 0 <= benchmark.peak_memory([(12, 4)])[12, 4] < 50
-
-
-@pytest.mark.torture
-def test_a_quick_run_writes_everything(tmp_path, monkeypatch):
+def test_a_quick_run_writes_everything_and_peak_memory_is_that_of_learning_alone(tmp_path, monkeypatch):
+    assert 0 <= benchmark.peak_memory([(12, 4)])[12, 4] < 50  # MB, without the hundreds that Python and torch take
     monkeypatch.setattr(benchmark, "peak_memory", lambda sizes: {(K, T): 0.1 * K * T for K, T in sizes})  # a process a size
     monkeypatch.setattr(benchmark, "code_revision", lambda _: "abc+changes" if any(tmp_path.iterdir()) else "abc")
     assert benchmark.main(["--quick", "--out", str(tmp_path)]) == 0
@@ -196,9 +183,8 @@ def test_a_quick_run_writes_everything(tmp_path, monkeypatch):
     assert list(frame.columns[:6]) == FIRST_COLUMNS
     compared = frame[~frame["what"].str.startswith("scaling")]
     rows = set(compared[["what", "threads"]].itertuples(index=False, name=None))
-    for what in (subjects.OURS, subjects.OURS_AS_SET, subjects.BOUND, subjects.GATES):
-        assert {(what, 1), (what, 2)} <= rows
-    assert (subjects.SIDE_BY_SIDE, 2) in rows
+    of_ours = product((subjects.OURS, subjects.OURS_AS_SET, subjects.BOUND, subjects.GATES), (1, 2))
+    assert {*of_ours, (subjects.SIDE_BY_SIDE, 2)} <= rows
     assert len(compared) == 10 + 4 * subjects.library_installed() + subjects.installed("jax")
     assert len(frame) - len(compared) == len(subjects.scaling_sizes(subjects.QUICK))
     assert (frame[["steps_per_s", "ratio_to_bound", "seconds_min"]] > 0).all(axis=None)

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from helpers.__main__ import COMMANDS
+from helpers.report.publish import GLANCE
 from helpers.runs.sources import PROJECT
 
 PAGES = {
@@ -32,10 +33,11 @@ def block(name):
     return found
 
 
-def test_readme_is_short_and_its_commands_stand_before_its_tables():
+def test_readme_is_short_its_commands_stand_before_its_tables_and_it_leads_to_every_page():
     readme = PAGES["README.md"]
     assert len(readme.splitlines()) <= 130
     assert readme.index("download.pytorch.org") < readme.index("make reports   #") < readme.index("<!-- glance")
+    assert PAGES.keys() - {"README.md"} <= set(LINK.findall(readme))
 
 
 def test_no_sentence_stands_twice():
@@ -47,53 +49,24 @@ def test_no_sentence_stands_twice():
 
 
 @published
-def test_the_comparison_at_a_glance_is_that_of_the_reference_run():
-    """The paper's gap from comparison.csv; expert error, gaps and online share from seeds.csv: the median over the seeds."""
-    compared = pd.read_csv(REFERENCE / "comparison.csv").set_index(["case", "row"])
-    every = pd.read_csv(REFERENCE / "seeds.csv")
-    gaps = every.query("metric == 'feature_gap'").groupby(["stage", "case"])["value"].median()
-    reached = every.query("metric == 'objective_x'").pivot_table(index=["case", "seed"], columns="stage", values="value")
-    shares = (100 * reached["online"] / reached["minimum_variance"]).groupby("case").median()
-    experts = every.query("stage == 'expert'").pivot_table(index=["case", "seed"], columns="metric", values="value")
+def test_the_numbers_are_those_of_the_reference_run():
+    gaps, time, limits = (pd.read_csv(REFERENCE / f"tables/{name}.csv") for name in ("gaps", "time", "limits_gaps"))
     rows = [line for line in block("glance").splitlines() if re.match(r"\| *I", line)]
-    assert len(rows) == 3
-    for case, row in enumerate(rows, start=1):
-        expert, policy = compared.loc[(case, "expert")], compared.loc[(case, "policy")]
-        printed = expert.set_index("feature")["published"].add_prefix("v:")
-        error = (experts.loc[case, printed.index] / printed - 1).abs().mean(axis=1).median()
-        paper = (policy["published"].to_numpy() / expert["published"].to_numpy() - 1).__abs__().mean()
-        ours, as_printed = (100 * gaps[stage, case] for stage in ("offline", "offline_printed"))
-        assert re.search(rf"\| *{'I' * case} *\|", row)
-        found = [float(number) for number in PERCENT.findall(row)]
-        assert found == pytest.approx([100 * error, 100 * paper, ours, as_printed, shares[case]], abs=0.051)
-    n_seeds = compared["n_seeds"].unique().tolist()
-    assert ("one seed" if n_seeds == [1] else f"{n_seeds[0]} seeds") in block("glance")
-
-
-@published
-def test_the_costs_are_those_of_the_reference_run():
-    seconds = pd.read_csv(REFERENCE / "tables/time.csv")["seconds"].sum()
+    for row, case in zip(rows, gaps.to_dict("records"), strict=True):
+        assert [float(number) for number in PERCENT.findall(row)] == pytest.approx([100 * case[name] for name in GLANCE], abs=0.051)
+    n_seeds = gaps["n_seeds"].min()
+    assert ("one seed" if n_seeds == 1 else f"{n_seeds} seeds") in block("glance")
     provenance = json.loads((REFERENCE / "provenance.json").read_text(encoding="utf-8"))
     minutes, n_seeds, hours = map(float, re.findall(r"\d+(?:\.\d+)?", block("cost")))
     assert n_seeds == len(provenance["seeds"])
-    assert (minutes, hours) == pytest.approx((seconds / 60, provenance["stage_seconds"] / 3600), abs=0.51)
-
-
-@published
-def test_the_times_are_those_of_the_reference_run():
-    table = pd.read_csv(REFERENCE / "tables/time.csv")
+    assert (minutes, hours) == pytest.approx((time["seconds"].sum() / 60, provenance["stage_seconds"] / 3600), abs=0.51)
     rows = {line.split("|")[1].strip(): line for line in block("time").splitlines() if line.startswith("|")}
-    for stage, times in table.groupby("stage")["seconds"]:
+    for stage, times in time.groupby("stage")["seconds"]:
         assert re.findall(r"\b\d+\b", rows[stage].replace(stage, "")) == [f"{seconds:.0f}" for seconds in times]
-
-
-@published
-def test_the_gaps_to_the_optimum_are_those_of_the_reference_run():
-    every = pd.read_csv(REFERENCE / "tables/limits_gaps.csv").set_index("controller")
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in block("limits").splitlines()[2:]]
-    assert len(rows) == 11
-    for controller, *cells in rows:
-        assert cells == every.loc[controller].filter(like="= 30").tolist()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in block("limits").splitlines()[2:]]
+    assert len(cells) == 11
+    every = limits.set_index("controller")
+    assert [row for row in cells if row[1:] != every.loc[row[0]].filter(like="= 30").tolist()] == []
 
 
 @published
@@ -132,10 +105,6 @@ def test_links_lead_to_files_and_headings(page, link):
         assert anchor in anchors(target.read_text(encoding="utf-8"))
 
 
-def test_every_page_can_be_reached_from_readme():
-    assert {path for path in PAGES if path != "README.md"} <= set(LINK.findall(PAGES["README.md"]))
-
-
 def test_the_targets_and_settings_named_exist():
     makefile = (PROJECT / "Makefile").read_text(encoding="utf-8")
     targets = set(re.findall(r"^(\w+):", makefile, re.MULTILINE))
@@ -160,9 +129,8 @@ def test_the_commands_of_helpers_and_snakemake_name_what_there_is(line):
 
 
 def test_every_parameter_file_is_listed():
-    assert {path.name for path in (PROJECT / "params").glob("*.yaml")} == set(
-        re.findall(r"params/(\w+\.yaml)\)", PAGES["docs/parameters.md"])
-    )
+    listed = set(re.findall(r"params/(\w+\.yaml)\)", PAGES["docs/parameters.md"]))
+    assert listed == {path.name for path in (PROJECT / "params").glob("*.yaml")}
 
 
 def test_the_papermill_commands_name_notebooks_and_their_parameters():

@@ -87,10 +87,16 @@ def test_response_table_holds_mean_and_deviation_of_true_states_and_applied_inpu
 
 
 @pytest.mark.parametrize("n_loops", [1, 2, 3])
-def test_control_figure_draws_every_response_as_given(n_loops: int) -> None:
+def test_control_figure_draws_every_response_as_given_and_names_it(n_loops: int) -> None:
     table = response(n_loops)
-    axes = draw(n_loops, table).axes
+    figure = draw(n_loops, table)
+    axes, shown = figure.axes, texts(figure)
     assert len(axes) == 3 * n_loops  # response, control and zoom of each loop
+    assert all(DEVIATION in panel.get_ylabel().replace("\n", " ") for panel in axes)
+    assert shown.count("control interaction (sample)") == 2 * n_loops
+    parts = ("$C_{A0}^*$", "agent", "PID", "set point", "standard deviation", "manipulated variable")
+    assert all(part in shown for part in (*parts, *(rf"\mathbf{{{letter}}}" for letter in "ABCDEF"[: 2 * n_loops])))
+    assert ("Jacket temperature $T_E^*$" in shown) is (n_loops > 1)
     for loop in range(n_loops):
         for panel, variable, start in zip(
             axes[3 * loop : 3 * loop + 3], (OUTPUTS[loop], INPUTS[loop], OUTPUTS[loop]), (0, 0, 5), strict=True
@@ -136,19 +142,6 @@ def test_control_figure_has_the_colours_of_the_paper_and_styles_that_differ() ->
     assert styles == {"agent": {"-"}, "PID": {"--"}}
     for axes in drawn.axes:  # the legend speaks of the lines that are drawn
         assert {to_hex(line.get_color()) for line in axes.lines} <= set(hues.values())
-
-
-@pytest.mark.parametrize("n_loops", [2, 3])
-def test_control_figure_names_panels_variables_units_and_all_that_is_drawn(n_loops: int) -> None:
-    figure = draw(n_loops)
-    shown = texts(figure)
-    for letter in "ABCDEF"[: 2 * n_loops]:
-        assert rf"\mathbf{{{letter}}}" in shown
-    for axes in figure.axes:
-        assert DEVIATION in axes.get_ylabel().replace("\n", " ")
-    assert shown.count("control interaction (sample)") == 2 * n_loops
-    parts = ("Jacket temperature $T_E^*$", "$C_{A0}^*$", "agent", "PID", "set point", "standard deviation", "manipulated variable")
-    assert all(part in shown for part in parts)
 
 
 def budget_figure() -> Figure:
@@ -209,19 +202,18 @@ def test_a_response_without_a_variable_is_refused() -> None:
         draw(2, table.query("controller == 'expert' or variable != 'T_E'"))
 
 
-def several(table: pd.DataFrame, columns: list[str], n_seeds: int = 4) -> pd.DataFrame:
-    """The table for several seeds, its columns shifted by 0, 1, 2 and 10."""
-    shifts = (0.0, 1.0, 2.0, 10.0)[:n_seeds]
-    frames = [table.assign(seed=seed, **{name: table[name] + shift for name in columns}) for seed, shift in enumerate(shifts)]
+def several(table: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
+    """The table for four seeds, its columns shifted by 0, 1, 2 and 10."""
+    shifts = enumerate((0.0, 1.0, 2.0, 10.0))
+    frames = [table.assign(seed=seed, **{name: table[name] + shift for name in columns}) for seed, shift in shifts]
     return pd.concat(frames, ignore_index=True)
 
 
-@pytest.mark.torture
-def test_several_seeds_are_thin_lines_about_their_median() -> None:
+def test_several_seeds_are_thin_lines_about_their_median_and_an_input_is_held_until_the_next_sample() -> None:
     table = response()
     figure = draw(2, several(table, ["mean", "std"]))
     expected = rows_of(table, "agent", "T")
-    panel = next(axes for axes in figure.axes if axes.get_label() == "B T")
+    panel, of_input = ({axes.get_label(): axes for axes in figure.axes}[name] for name in ("B T", "T_E"))
     (line,) = [line for line in panel.lines if line.get_label() == "controlled, agent"]
     np.testing.assert_allclose(curve(line)[:, 1], expected["mean"] + 1.5)
     (*_, thin) = [collection for collection in panel.collections if collection.get_label() == figures.SINGLE]
@@ -236,13 +228,8 @@ def test_several_seeds_are_thin_lines_about_their_median() -> None:
     shown = texts(figure)
     assert "medians over 4 seeds" in shown
     assert "the mean of each seed" in shown
-
-
-def test_an_input_of_each_seed_is_held_until_the_next_sample() -> None:
-    figure = draw(2, several(response(), ["mean"], 2))
-    panel = next(axes for axes in figure.axes if axes.get_label() == "T_E")
-    thin = next(collection for collection in panel.collections if collection.get_label() == figures.SINGLE)
-    points = np.asarray(thin.get_paths()[0].vertices)
+    held = next(collection for collection in of_input.collections if collection.get_label() == figures.SINGLE)
+    points = np.asarray(held.get_paths()[0].vertices)
     assert points[-1, 0] == N_STEPS
     assert ((np.diff(points[:, 0]) == 0) | (np.diff(points[:, 1]) == 0)).all()
 
@@ -287,32 +274,18 @@ def test_learning_curves_draw_return_gap_and_every_weight() -> None:
     assert curve(gap.lines[1])[:, 1].tolist() == [0.037, 0.037]
     assert all(curve(axes.lines[-1])[:, 0].tolist() == [40, 40] for axes in figure.axes)
     shown = texts(figure)
-    for part in (*labels, "PID", "the paper", "policy kept", "epoch", "discounted return"):
-        assert part in shown
+    assert all(part in shown for part in (*labels, "PID", "the paper", "policy kept", "epoch", "discounted return"))
+    names = [f"{loop}-{kind}" for kind in ("I", "II", "III") for loop in OUTPUTS]
+    assert len({str(style) for style in figures.feature_styles(names).values()}) == 9  # each has one of its own
+    fewer = table[["epochs", "mean_return", "feature_gap"]]  # a panel for what the history holds
+    for number, found in ((2, fewer), (1, fewer.drop(columns="feature_gap")), (1, fewer.assign(feature_gap=np.nan))):
+        assert len(figures.learning_curves(found).axes) == number
 
 
-def test_each_feature_has_a_style_of_its_own() -> None:
-    styles = figures.feature_styles([f"{loop}-{kind}" for kind in ("I", "II", "III") for loop in OUTPUTS])
-    assert len({str(style) for style in styles.values()}) == len(styles) == 9
-
-
-@pytest.mark.parametrize("columns", [["epochs", "mean_return"], ["epochs", "mean_return", "feature_gap"]])
-def test_learning_curves_draw_what_the_history_holds(columns: list[str]) -> None:
-    figure = figures.learning_curves(history()[columns])
-    assert len(figure.axes) == len(columns) - 1
-    assert len(figures.learning_curves(history()[columns].assign(feature_gap=np.nan)).axes) == 1
-
-
-def test_the_drawings_name_what_they_show() -> None:
-    drawn = {
-        "Controller|Process|u_t|x_t|y_{t+1}|R_{t+1}": drawings.mdp_figure(),
-        r"Offline|Online|Process data|MaxEnt IRL|REINFORCE|\alpha^*|real objective|new set point": drawings.framework_figure(),
-        r"layer 3|12 cells|34 cells|56 cells|56 → 10|slope 0.02|ReLU6|(3)|(5)|\sigma_t|u_{max}": drawings.network_figure(
-            (12, 34, 56), 3, 5, 0.02
-        ),
-    }
-    for parts, figure in drawn.items():
-        assert all(part in texts(figure) for part in parts.split("|"))
+def test_the_drawing_of_a_network_names_its_layers_and_their_cells() -> None:
+    shown = texts(drawings.network_figure((12, 34, 56), 3, 5, 0.02))
+    parts = r"layer 3|12 cells|34 cells|56 cells|56 → 10|slope 0.02|ReLU6|(3)|(5)|\sigma_t|u_{max}"
+    assert all(part in shown for part in parts.split("|"))
 
 
 def test_drawn_summary_reads_back_what_was_drawn() -> None:
@@ -333,8 +306,9 @@ def test_drawn_summary_reads_back_what_was_drawn() -> None:
     assert len(summary) == 12 + 8 + 4
 
 
-def test_style_does_not_change_what_was_drawn() -> None:
+def test_style_does_not_change_what_was_drawn_and_figures_are_left_to_the_caller() -> None:
     plain = figures.drawn_summary(draw())
+    assert matplotlib.pyplot.get_fignums() == []
     with matplotlib.rc_context({"lines.linewidth": 9, "axes.grid": False, "font.size": 5, "figure.dpi": 50}):
         pd.testing.assert_frame_equal(figures.drawn_summary(draw()), plain)
 
@@ -346,8 +320,3 @@ def test_svg_is_the_same_each_time_and_its_text_is_text(tmp_path: Path) -> None:
     one = (tmp_path / "one.svg").read_text(encoding="utf-8")
     assert one == (tmp_path / "two.svg").read_text(encoding="utf-8")
     assert "control interaction (sample)" in one
-
-
-def test_figures_are_left_to_the_caller() -> None:
-    draw()
-    assert matplotlib.pyplot.get_fignums() == []

@@ -1,5 +1,6 @@
 """The section of the report on limits: what it shows is what notebook 06 wrote, and it is not there where that was not run."""
 
+from itertools import product
 from types import SimpleNamespace
 
 import pandas as pd
@@ -12,17 +13,18 @@ from helpers.runs.sources import PROJECT
 from helpers.settings.paper import load
 
 
-@pytest.fixture
-def results(root, tmp_path):
-    def build(seeds, written=True):
-        params = {case: load(root, case) for case in (1, 2)}
-        limits = {}
-        for case in params:
-            for seed in range(seeds if written else 0):
-                folder = tmp_path / f"seed_{seed}/case_{case}"
-                write(folder, 10.0 * case + seed)
-                limits |= {(case, seed, part): load_stage(folder / f"limits_{part}", "notebook 06") for part in LIMITS}
-        return SimpleNamespace(params=params, limits=limits)
+@pytest.fixture(scope="module")
+def results(root, tmp_path_factory):
+    """What notebook 06 wrote of two cases, for as many seeds as a test asks for, five at most."""
+    folder, stages = tmp_path_factory.mktemp("limits"), {}
+    for case, seed in product((1, 2), range(5)):
+        place = folder / f"seed_{seed}/case_{case}"
+        write(place, 10.0 * case + seed)
+        stages |= {(case, seed, part): load_stage(place / f"limits_{part}", "notebook 06") for part in LIMITS}
+
+    def build(seeds):
+        limits = {place: stage for place, stage in stages.items() if place[1] < seeds}
+        return SimpleNamespace(params={case: load(root, case) for case in (1, 2)}, limits=limits)
 
     return build
 
@@ -60,9 +62,7 @@ def write(folder, level):
 
 
 def test_nothing_where_it_was_not_run(results):
-    assert limits_report.tabulate(results(1, written=False)) == {}
-    assert limits_report.draw(results(1, written=False)) == {}
-    assert limits_findings.find(results(1, written=False)) == {}
+    assert [show(results(0)) for show in (limits_report.tabulate, limits_report.draw, limits_findings.find)] == [{}, {}, {}]
 
 
 def test_one_seed_shows_its_monte_carlo_interval(results):
@@ -99,6 +99,10 @@ def test_several_seeds_show_medians(results):
     assert [axes.get_label() for axes in figures["limits_gaps"].axes] == ["A case 1", "B case 2"]
     first = {line.get_label(): sorted(line.get_xdata()) for line in figures["limits_robustness"].axes[0].lines[:-1]}
     assert first == {"model": [50.0, 100.0, 100.0], "set points": [40.0, 100.0, 120.0]}
+    budget = found["limits_budget"].set_index(["case", "controller"])
+    assert budget.loc[("I", "PPO from scratch"), "least to greatest at the end"] == "10.00 to 12.00"
+    pairs = limits_report.tabulate(results(1))["limits_pairs"].set_index(["case", "rival"])
+    assert pairs.loc[("I", "PPO from scratch")].tolist() == ["14.00", "2.00"]
 
 
 @pytest.mark.parametrize(
@@ -116,34 +120,28 @@ def test_what_a_seed_never_reached_counts_as_long(times, shown):
     assert table["Rise 10-90 %, $T^*$ (time)"].tolist() == [shown]
 
 
-@pytest.mark.torture
-def test_the_papers_way_beside_its_rivals(results):
-    budget = limits_report.tabulate(results(3))["limits_budget"].set_index(["case", "controller"])
-    assert budget.loc[("I", "PPO from scratch"), "least to greatest at the end"] == "10.00 to 12.00"
-    pairs = limits_report.tabulate(results(1))["limits_pairs"].set_index(["case", "rival"])
-    assert pairs.loc[("I", "PPO from scratch")].tolist() == ["14.00", "2.00"]
-    assert limits_findings.standings(results(1)) == {}
-    assert limits_findings.standings(results(5)) == {0: {"ppo": {"ahead": [1, 2]}}, 500: {"ppo": {"ahead": [1, 2]}}}
+def test_what_several_seeds_say(results):
+    """Improving on the plant reaches 10 to 14 in Case I and 20 to 24 in Case II; minimum variance has 15 there, the MPC 18.
 
-
-def test_where_improving_on_the_plant_beats_who_does_not_know_it(results):
-    """It reaches 10 to 14 in Case I and 20 to 24 in Case II; minimum variance has 15 there, the MPC of the grid 18."""
+    The searches for gains end at 5 to 7 in Case I and at 10 to 12 in Case II, from 10.
+    """
     assert limits_findings.there(results(4)) == {}  # too few for an interval
     behind = ["offset-free MPC", "minimum variance on y"]
     assert limits_findings.there(results(5)) == {"A x 1.3, B x 0.7": {1: behind, 2: []}}
+    assert limits_findings.standings(results(1)) == {}
+    assert limits_findings.standings(results(5)) == {0: {"ppo": {"ahead": [1, 2]}}, 500: {"ppo": {"ahead": [1, 2]}}}
+    found = limits_findings.tuned(results(3))
+    assert found[1] == {"better": 0, "seeds": 3, "least": 5.0, "greatest": 6.0}
+    assert found[2] == {"better": 1, "seeds": 3, "least": 10.0, "greatest": 11.0}
 
 
-def test_plants_that_cannot_hold_the_set_point_are_left_out(results):
+def test_what_one_seed_says(results):
     """With A doubled, or times 1.3 and B times 0.7, the inputs that hold the set point of Case II lie above their bounds."""
     run = results(1)
     assert limits_findings.left_out(run) == {"model": {2: (2, 3)}}
     assert limits_findings.out_of_reach(run) == {"A x 1.3, B x 0.7": [2]}
     kept = limits_report.worst(run).query("group == 'model'").set_index(["case", "controller"])["value"]
     assert (kept[1, "online"], kept[2, "online"]) == (50.0, 80.0)
-
-
-def test_what_one_seed_says(results):
-    run = results(1)
     found = limits_findings.find(run)
     assert found["seeds"] == {1: 1, 2: 1}
     assert found["attainable"][2] == pytest.approx({"look_ahead": 1.0, "noise": 5.0, "filter": 2.5})
@@ -160,13 +158,6 @@ def test_what_one_seed_says(results):
     assert (found["price"][1]["worse"], found["price"][2]["model"]) == (50.0, 80.0)
     improved = limits_report.tabulate(run)["limits_improved"].set_index(["case", "controller"])
     assert improved.loc[("II", "improved on that plant"), "A x 1.3, B x 0.7"] == "20.0"
-
-
-def test_what_the_searches_for_gains_came_to(results):
-    """They end at 5 to 7 in Case I and at 10 to 12 in Case II, from 10."""
-    found = limits_findings.tuned(results(3))
-    assert found[1] == {"better": 0, "seeds": 3, "least": 5.0, "greatest": 6.0}
-    assert found[2] == {"better": 1, "seeds": 3, "least": 10.0, "greatest": 11.0}
 
 
 def test_what_needs_no_plant(results):

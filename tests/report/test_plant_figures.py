@@ -1,5 +1,7 @@
 """The figures of one's own plant show what is in the tables, with units; the guard's trial runs as planned."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -51,11 +53,8 @@ def test_an_episode_is_shown_in_engineering_units_under_every_controller(plant, 
     operation = Operation((0,), none - 1, none + 1, none + 1, bounds)
     record = Gains(*(torch.eye(2, 3) for _ in range(3)))
     workshop = learn.Workshop(plant, operation, record, 1.0, *[model.to(torch.float32)] * 4)
-    figure = plant_figures.loops_figure(
-        workshop,
-        {gate.RECORD: TrackingPID(record, workshop.operation.bounds), gate.POLICY: TrackingPID(record, workshop.operation.bounds)},
-        plant.description,
-    )
+    pid = TrackingPID(record, workshop.operation.bounds)
+    figure = plant_figures.loops_figure(workshop, {gate.RECORD: pid, gate.POLICY: pid}, plant.description)
     shown = drawn_summary(figure).set_index(["panel", "artist"])
     assert [axis.get_label() for axis in figure.axes] == [*plant.controlled, *plant.manipulated]
     assert "set point" in shown.loc["y0"].index
@@ -89,19 +88,9 @@ def test_the_validation_figure_shows_a_window_and_the_residuals(plant):
     assert shown.loc[("y0 residuals", "autocorrelation"), "points"] == 20
 
 
-class Asking:
-    def __init__(self):
-        self.notes = {}
-
-    def reset(self):
-        pass
-
-    def step(self, y, set_point, u_previous):
-        return u_previous + 0.1
-
-
 def test_a_trial_goes_from_manual_to_policy_to_hold_to_pid_and_back(plant, model):
-    guard = Guard(Asking(), plant.description)
+    asking = SimpleNamespace(notes={}, reset=lambda: None, step=lambda y, set_point, u_previous: u_previous + 0.1)
+    guard = Guard(asking, plant.description)
     trial = Trial(n_samples=60, hand_over=5, step=8, fault=range(30, 40), faulty=1)
     steps, seconds = commission(guard, model, trial, torch.Generator().manual_seed(0))
     modes = steps["mode"].ne(steps["mode"].shift()).cumsum()

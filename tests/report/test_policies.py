@@ -76,11 +76,8 @@ def test_a_written_policy_holds_its_score(written, name):
 def test_a_published_policy_holds_its_score(name):
     """On its card, and among the raw numbers of all seeds."""
     holds(name, FOLDER)
-    raw = (
-        pd.read_csv(FOLDER.parent / "seeds.csv")
-        .query("seed == 0 and metric == 'objective_x'")
-        .set_index(["case", "stage"])["value"]
-    )
+    every = pd.read_csv(FOLDER.parent / "seeds.csv").query("seed == 0 and metric == 'objective_x'")
+    raw = every.set_index(["case", "stage"])["value"]
     for case, scores in load_policy(name).card["scores"].items() if name != "one_policy" else ():
         assert scores["policy"] == pytest.approx(raw[int(case), name.split("_")[-1]], rel=1e-3)
 

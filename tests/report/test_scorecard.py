@@ -1,16 +1,15 @@
 """The verdict rule and its edges, and medians, gaps and lists against cases built by hand."""
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import bootstrap
 
 from helpers.report import scorecard
+from helpers.report.statistics import median_interval
+from helpers.runs.sources import PROJECT
 from helpers.settings.paper import PublishedCase, load_published
 
-PARAMS = Path(__file__).resolve().parents[2] / "params"
+PAPER = load_published(PROJECT / "params")
 FEATURES = ["C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III"]
 TWO = ["h-I", "h-II"]
 SMALL = {4: PublishedCase(table=9, expert=(10.0, -2.0), policy=(11.0, -2.5), alpha=(0.6, -0.8))}
@@ -44,45 +43,30 @@ def compare(runs: pd.DataFrame, published=None, names=None) -> pd.DataFrame:
     return scorecard.comparison(published or SMALL, runs, scorecard.summary(runs), names or TWO, MEASURED)
 
 
-# The rule ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
-    ("published", "low", "high", "expected", "reason"),
+    ("row", "published", "n_seeds", "low", "high", "expected", "reason"),
     [
-        (10.0, 9.0, 11.0, "match", "inside 9.00 to 11.00"),
-        (10.0, 10.0, 11.0, "match", "inside 10.00 to 11.00"),  # an end belongs to the interval
-        (10.0, 9.0, 10.0, "match", "inside 9.00 to 10.00"),
-        (10.0, 10.01, 11.0, "differs", "0.01 below the interval"),
-        (10.0, 9.0, 9.6, "differs", "0.4 above the interval"),
-        (-10.0, -9.6, -9.0, "differs", "0.4 below the interval"),
-        (10.0, 7.5, 12.5, "match", "inside 7.50 to 12.50"),  # a quarter to either side still tells
-        (10.0, 7.49, 12.51, "cannot tell", "one run scatters by 2.5 to either side of 10.00"),
-        (-10.0, -12.51, -7.49, "cannot tell", "one run scatters by 2.5 to either side of -10.00"),
-        (-10.0, -12.5, -7.5, "match", "inside -12.50 to -7.50"),
-        (10.0, 12.0, 17.2, "differs", "2 below the interval"),  # outside tells, however wide
+        ("policy", 10.0, 20, 9.0, 11.0, "match", "inside 9.00 to 11.00"),
+        ("policy", 10.0, 20, 10.0, 11.0, "match", "inside 10.00 to 11.00"),  # an end belongs to the interval
+        ("policy", 10.0, 20, 9.0, 10.0, "match", "inside 9.00 to 10.00"),
+        ("policy", 10.0, 20, 10.01, 11.0, "differs", "0.01 below the interval"),
+        ("policy", 10.0, 20, 9.0, 9.6, "differs", "0.4 above the interval"),
+        ("policy", -10.0, 20, -9.6, -9.0, "differs", "0.4 below the interval"),
+        ("policy", 10.0, 20, 7.5, 12.5, "match", "inside 7.50 to 12.50"),  # a quarter to either side still tells
+        ("policy", 10.0, 20, 7.49, 12.51, "cannot tell", "one run scatters by 2.5 to either side of 10.00"),
+        ("policy", -10.0, 20, -12.51, -7.49, "cannot tell", "one run scatters by 2.5 to either side of -10.00"),
+        ("policy", -10.0, 20, -12.5, -7.5, "match", "inside -12.50 to -7.50"),
+        ("policy", 10.0, 20, 12.0, 17.2, "differs", "2 below the interval"),  # outside tells, however wide
+        ("policy", 10.0, 1, np.nan, np.nan, "cannot tell", "one seed"),
+        ("expert", 10.0, 20, 9.0, 9.6, "fitted", "0.4 above the interval"),  # whatever its interval says
+        ("expert", 10.0, 20, 0.0, 20.0, "fitted", "inside 0.00 to 20.00"),
+        ("expert", 10.0, 1, np.nan, np.nan, "fitted", "one seed"),
+        ("alpha", 10.0, 0, np.nan, np.nan, "cannot tell", "no seed gave it"),
+        ("alpha", 0.5, 2, 0.4, 0.501, "match", "inside 0.400 to 0.501"),
     ],
 )
-def test_the_verdict_and_its_reason(published, low, high, expected, reason):
-    assert scorecard.verdict("policy", published, 20, low, high) == (expected, reason)
-
-
-@pytest.mark.parametrize(
-    ("given", "expected"),
-    [
-        (("expert", 10.0, 20, 9.0, 9.6), ("fitted", "0.4 above the interval")),  # whatever its interval says
-        (("expert", 10.0, 20, 0.0, 20.0), ("fitted", "inside 0.00 to 20.00")),
-        (("expert", 10.0, 1, np.nan, np.nan), ("fitted", "one seed")),
-        (("policy", 10.0, 1, np.nan, np.nan), ("cannot tell", "one seed")),
-        (("alpha", 10.0, 0, np.nan, np.nan), ("cannot tell", "no seed gave it")),
-        (("alpha", 0.5, 2, 0.4, 0.501), ("match", "inside 0.400 to 0.501")),
-    ],
-)
-def test_the_expert_is_fitted_and_one_seed_cannot_tell(given, expected):
-    assert scorecard.verdict(*given) == expected
-
-
-# Medians and intervals -----------------------------------------------------------------------------------------------
+def test_the_verdict_and_its_reason(row, published, n_seeds, low, high, expected, reason):
+    assert scorecard.verdict(row, published, n_seeds, low, high) == (expected, reason)
 
 
 def test_summary_has_the_median_and_its_interval_for_every_number():
@@ -96,21 +80,16 @@ def test_summary_has_the_median_and_its_interval_for_every_number():
     values = 0.02 + np.arange(7) / 100
     assert row[["median", "least", "greatest"]].tolist() == pytest.approx([0.05, 0.02, 0.08])
     assert row["p90"] == pytest.approx(0.074)
-    resampled = bootstrap((values,), np.median, method="percentile", n_resamples=4000, rng=np.random.default_rng(5))
-    assert row[["ci_low", "ci_high"]].tolist() == pytest.approx(list(resampled.confidence_interval), abs=1e-12)
+    assert row[["ci_low", "ci_high"]].tolist() == pytest.approx(median_interval(values).tolist(), abs=1e-12)
 
 
 def test_comparison_holds_intervals_of_the_median_and_of_one_run():
     table = compare(seeds())
     assert list(table.columns) == scorecard.COLUMNS
-    assert table[["table", "case", "row", "feature", "published", "n_seeds"]].to_numpy().tolist() == [
-        [9, 4, "expert", "h-I", 10.0, 6],
-        [9, 4, "expert", "h-II", -2.0, 6],
-        [9, 4, "policy", "h-I", 11.0, 6],
-        [9, 4, "policy", "h-II", -2.5, 6],
-        [9, 4, "alpha", "h-I", 0.6, 5],
-        [9, 4, "alpha", "h-II", -0.8, 5],
-    ]
+    rows = [(row, name) for row in ("expert", "policy", "alpha") for name in TWO]
+    assert table[["table", "case", "row", "feature"]].to_numpy().tolist() == [[9, 4, *place] for place in rows]
+    assert table["published"].tolist() == [10.0, -2.0, 11.0, -2.5, 0.6, -0.8]
+    assert table["n_seeds"].tolist() == [6, 6, 6, 6, 5, 5]
     assert table["reproduced"].tolist() == pytest.approx([10.5, -2.2, 11.0, -2.0, 0.605, -0.7])
     assert table["verdict"].tolist() == ["fitted", "fitted", "match", "differs", "match", "differs"]
     assert table.loc[3, ["ci_low", "ci_high"]].tolist() == [-2.0, -2.0]
@@ -146,16 +125,13 @@ def test_another_sampling_error_may_change_a_verdict():
     assert scorecard.outside(ours) == {"match": 0, "differs": 2, "cannot tell": 0, "fitted": 0}
 
 
-def test_a_number_that_is_nan_in_every_seed_is_one_that_no_seed_gave():
+def test_comparison_has_a_row_for_each_published_number_even_if_nobody_reproduced_it():
+    """Or if it is nan in every seed."""
     runs = seeds()
     runs.loc[runs["metric"] == "alpha:h-II", "value"] = np.nan
     row = compare(runs).iloc[5]
     assert (row["n_seeds"], row["verdict"], row["reason"]) == (0, "cannot tell", "no seed gave it")
-
-
-def test_comparison_has_a_row_for_each_published_number_even_if_nobody_reproduced_it():
-    published = {case: load_published(PARAMS)[case] for case in (1, 2, 3)}
-    table = compare(seeds().query("case == 1"), published, FEATURES)
+    table = compare(seeds().query("case == 1"), PAPER, FEATURES)
     assert len(table) == 54
     assert table[["reproduced", "ci_low", "pred_high"]].isna().all(axis=None)
     assert set(table["n_seeds"]) == {0}
@@ -185,29 +161,19 @@ def test_gaps():
     assert row["expert_error"] == pytest.approx((0.5 / 10 + 0.2 / 2) / 2)
     assert row["online_share"] == pytest.approx(0.925)
     assert row["online_share_low"] < 0.925 < row["online_share_high"]
-
-
-def test_gaps_of_the_paper_and_of_seeds_that_are_missing():
-    published = {case: load_published(PARAMS)[case] for case in (1, 2, 3)}
-    table = scorecard.gaps(scorecard.summary(with_ratios(seeds(1).query("case == 4"), published, FEATURES)), published)
+    # Of the paper, and of seeds that are missing.
+    table = scorecard.gaps(scorecard.summary(with_ratios(seeds(1).query("case == 4"), PAPER, FEATURES)), PAPER)
     assert (100 * table["published_gap"]).round(1).tolist() == [3.7, 13.7, 11.5]
     assert table["n_seeds"].tolist() == [0, 0, 0]
     assert table[["feature_gap", "expert_error", "online_share"]].isna().all(axis=None)
 
 
-# Counts for the opening page -----------------------------------------------------------------------------------------
-
-
-def test_counts_of_verdicts():
+def test_verdicts_are_counted_and_so_are_features_that_differ_and_lie_nearer_to_the_printed_expert():
+    """h-II of the policy: printed 2.5, ours 2.0, the printed expert 2.0; h-I matches."""
     table = compare(seeds())
     counts = scorecard.counts(table)
     assert list(counts) == ["published numbers", "match", "differs", "cannot tell", "fitted"]
     assert counts.to_numpy()[:, 1:].tolist() == [[0, 0, 0, 2], [1, 1, 0, 0], [1, 1, 0, 0]]
-
-
-def test_features_that_differ_and_lie_nearer_to_the_printed_expert_are_counted():
-    """h-II of the policy: printed 2.5, ours 2.0, the printed expert 2.0; h-I matches."""
-    table = compare(seeds())
     assert scorecard.nearer_to_expert(table) == 1
     table.loc[3, "reproduced"] = -2.6
     assert scorecard.nearer_to_expert(table) == 0

@@ -18,12 +18,9 @@ def test_the_interval_of_the_median_is_that_of_the_exact_bootstrap(n_runs):
     np.testing.assert_allclose(median_interval(values), [low, high], rtol=1e-12)
 
 
-def test_many_rows_at_once_are_each_row_alone():
+def test_many_rows_at_once_are_each_row_alone_and_too_few_runs_give_no_interval_of_the_median():
     rows = np.random.default_rng(0).normal(size=(7, 6))
     np.testing.assert_array_equal(median_interval(rows), [median_interval(row) for row in rows])
-
-
-def test_too_few_runs_give_no_interval_of_the_median():
     assert np.isnan(median_interval(np.ones((3, FEWEST - 1)))).all()
     assert np.isfinite(median_interval(np.arange(FEWEST))).all()
 

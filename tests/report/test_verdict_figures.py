@@ -60,10 +60,8 @@ def test_the_weights_are_drawn_while_they_are_learned_and_beside_the_printed_one
 
 
 def test_a_claim_has_a_mark_for_each_case_that_it_speaks_of():
-    rows = [
-        ("One claim", "holds", "in part", ""),
-        ("Another claim that is " + "very " * 30 + "long", "", "does not hold", "cannot tell"),
-    ]
+    long = f"Another claim that is {'very ' * 30}long"
+    rows = [("One claim", "holds", "in part", ""), (long, "", "does not hold", "cannot tell")]
     judged = pd.DataFrame(rows, columns=["statement", "I", "II", "III"]).assign(section="5", overall="", quantities="")
     (axes,) = verdict_figures.claims_figure(judged).axes
     marks = {(line.get_xdata()[0], line.get_label()): line.get_marker() for line in axes.lines}

@@ -57,12 +57,10 @@ def assert_equal(found, expected):
     assert all(left.dtype == right.dtype and torch.equal(left, right) for left, right in zip(found[2], expected[2], strict=True))
 
 
-MORE = [(online, "improved", "float32"), (frozen, "improved", "float32"), (budgeted, "improved", "float32")]
-LEARNING = [(offline, "improved", "float32"), (offline, "printed", "float64")]
-LEARNING += [pytest.param(*case, marks=pytest.mark.torture) for case in MORE]
+SLOW = [pytest.param(learn, "improved", "float32", marks=pytest.mark.torture) for learn in (online, frozen, budgeted)]
 
 
-@pytest.mark.parametrize(("learn", "variant", "dtype"), LEARNING)
+@pytest.mark.parametrize(("learn", "variant", "dtype"), [(offline, "improved", "float32"), (offline, "printed", "float64"), *SLOW])
 def test_a_finished_training_is_not_repeated_and_comes_back_to_the_last_bit(tmp_path, monkeypatch, learn, variant, dtype):
     first = learn(run(tmp_path, variant, dtype))
     assert first[2][0].dtype == getattr(torch, dtype)
@@ -125,24 +123,6 @@ def test_a_state_comes_back_as_it_was(tmp_path):
         assert torch.equal(found["deep"]["n"][0]["i"], torch.tensor(3))
 
 
-@pytest.fixture
-def kept(tmp_path):
-    """A training that has finished, and the file that holds what it gave."""
-    finished = Finished(tmp_path, "a")
-    finished.once(lambda: {"t": torch.ones(3)}, "b")
-    (path,) = tmp_path.iterdir()
-    return finished, path
-
-
-@pytest.mark.parametrize(
-    "damage", [lambda good: good[:-5], lambda good: good[:20], lambda good: b"", lambda good: b"\x80\x04." * 9]
-)
-def test_a_damaged_file_means_a_fresh_start(kept, damage):
-    finished, path = kept
-    path.write_bytes(damage(path.read_bytes()))
-    assert finished.once(lambda: {"fresh": 1}, "b") == {"fresh": 1}
-
-
 class Forged:
     """What a pickle would make when it is read."""
 
@@ -150,11 +130,27 @@ class Forged:
         return pytest.fail, ("code of the file was executed",)
 
 
-def test_a_forged_file_executes_nothing_and_is_refused(kept):
-    finished, path = kept
-    training = torch.load(path)["training"]
-    assert training.startswith(path.stem)
-    torch.save({"training": training, "state": {"t": Forged()}}, path)
+def forged(path):
+    """A file that names the training of the one at this path, and holds code."""
+    torch.save({"training": torch.load(path)["training"], "state": {"t": Forged()}}, path)
+    return path.read_bytes()
+
+
+DAMAGE = {
+    "cut": lambda path: path.read_bytes()[:-5],
+    "header": lambda path: path.read_bytes()[:20],
+    "empty": lambda path: b"",
+    "pickle": lambda path: b"\x80\x04." * 9,
+    "forged": forged,
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
+def test_a_damaged_file_means_a_fresh_start_and_a_forged_one_executes_nothing(tmp_path, damage):
+    finished = Finished(tmp_path, "a")
+    finished.once(lambda: {"t": torch.ones(3)}, "b")
+    (path,) = tmp_path.iterdir()
+    path.write_bytes(damage(path))
     assert finished.once(lambda: {"fresh": 1}, "b") == {"fresh": 1}
 
 

@@ -41,15 +41,15 @@ def here(monkeypatch, tmp_path):
 
 @pytest.fixture
 def toy(monkeypatch, here):
-    """Notebooks of one cell, in a folder that stands for the project's."""
+    """Write a notebook of one cell, perhaps with others before it, in a folder that stands for the project's."""
+    path = here / "notebooks/02_offline_irl.ipynb"
+    path.parent.mkdir()
+    monkeypatch.setattr(run, "NOTEBOOKS", path.parent)
 
-    def write(code):
-        cell = nbformat.v4.new_code_cell("case = 1", metadata={"tags": ["parameters"]})
-        (here / "notebooks").mkdir(exist_ok=True)
-        nbformat.write(
-            nbformat.v4.new_notebook(cells=[cell, nbformat.v4.new_code_cell(code)]), here / "notebooks/02_offline_irl.ipynb"
-        )
-        monkeypatch.setattr(run, "NOTEBOOKS", here / "notebooks")
+    def write(code, *before):
+        given = nbformat.v4.new_code_cell("case = 1", metadata={"tags": ["parameters"]})
+        nbformat.write(nbformat.v4.new_notebook(cells=[*before, given, nbformat.v4.new_code_cell(code)]), path)
+        return path
 
     return write
 
@@ -81,44 +81,25 @@ def test_a_notebook_runs_from_any_directory_and_leaves_no_trace_of_the_machine(h
         assert f"{place}/" not in text_of(here / "copies/01.ipynb")
 
 
-WRONG_ARGUMENTS = {
-    "a misspelt parameter": (["01_demonstrations", "-p", "case", "1", "-p", "sed", "3"], "'sed'"),
-    "an unknown case": (["01_demonstrations", "-p", "case", "9"], "case_9.yaml"),
-    "text for a seed": (["01_demonstrations", "-p", "seed", "five"], "'seed'"),
-    "a strange digit": (["01_demonstrations", "-p", "seed", "²"], "'seed'"),
-    "an unknown scale": (["02_offline_irl", "-p", "scale", "huge"], "'huge'"),
-    "an unknown notebook": (["06_oracle"], "06_oracle.ipynb"),
-    "a notebook elsewhere": (["../notebooks/01_demonstrations"], "there is no such notebook"),
-    "results among the code": (["01_demonstrations", "-p", "output_root", str(PROJECT / "results/../src")], "'output_root'"),
+WRONG_ARGUMENTS = {  # the notebook, the copy and parameters; those of a notebook by hand are in test_session.py
+    "an unknown case": (["01_demonstrations", "copies/x.ipynb", "-p", "case", "9"], "case_9.yaml"),
+    "a strange digit": (["01_demonstrations", "copies/x.ipynb", "-p", "seed", "²"], "'seed'"),
+    "an unknown notebook": (["06_oracle", "copies/x.ipynb"], "06_oracle.ipynb"),
+    "a notebook elsewhere": (["../notebooks/01_demonstrations", "copies/x.ipynb"], "there is no such notebook"),
+    "a copy among the code": (["05_report", str(PROJECT / "results/../src/x.ipynb")], "'output'"),
+    "results among the code": (["01_demonstrations", "x.ipynb", "-p", "output_root", str(PROJECT / "src")], "'output_root'"),
 }
 
 
 @pytest.mark.parametrize(("arguments", "says"), WRONG_ARGUMENTS.values(), ids=WRONG_ARGUMENTS)
 def test_wrong_arguments_end_at_once_with_nothing_run_and_nothing_written(monkeypatch, here, capfd, arguments, says):
     monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, **__: pytest.fail("the notebook was run"))
-    notebook, *parameters = arguments
-    assert run.main([notebook, "copies/x.ipynb", "-p", "output_root", str(here / "out"), *parameters]) == 2
+    assert run.main(arguments) == 2
     said = capfd.readouterr().err
     assert said.startswith("error: ")
     assert said.count("\n") == 1
     assert says in said
     assert everything_below(here) == []
-
-
-@pytest.mark.parametrize("name", ["output", "output_root"])
-@pytest.mark.parametrize(
-    "place", ["src/x.ipynb", "notebooks/x.ipynb", "results/../x.ipynb", "reports/template", "reports/latest/../reference"]
-)
-def test_no_run_writes_over_what_the_project_is_made_of_nor_what_it_keeps(monkeypatch, here, capfd, name, place):
-    monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, **__: pytest.fail("the notebook was run"))
-    (here / "link").symlink_to(PROJECT)
-    for project in (PROJECT, here / "link"):
-        found = str(project / place)
-        assert run.main(["05_report", *([found] if name == "output" else ["x.ipynb", "-p", name, found])]) == 2
-        said = capfd.readouterr().err
-        assert said.startswith(f"error: parameter '{name}': inside the project results go below results/ and reports/ but not into")
-        assert said.count("\n") == 1
-    assert everything_below(here) == ["link"]
 
 
 def test_roots_are_those_of_the_callers_directory(monkeypatch, here):
@@ -148,40 +129,23 @@ def test_a_damaged_parameter_file_is_marked_for_the_summary_and_the_older_copy_s
     assert not (here / "01.failed").exists()
 
 
-@pytest.mark.torture
-def test_a_missing_result_ends_in_a_sentence_and_keeps_the_executed_copy(here, capfd):
-    roots = [("-p", f"{name}_root", str(here / folder)) for name, folder in (("input", "nothing"), ("output", "out"))]
-    arguments = ["02_offline_irl", "copies/02.ipynb", *roots[0], *roots[1]]
-    assert run.main(arguments) == 1
-    said = capfd.readouterr().err.strip()
-    missing = here / "nothing/lesson/seed_0/case_1/demonstrations/record.json"
-    sentence = f"ArtifactError: {missing}: this result is missing; run 01_demonstrations for case 1 first"
-    assert said.splitlines()[-1] == f"error: 02_offline_irl: {sentence} (executed copy with the traceback: copies/02.ipynb)"
-    assert everything_below(here) == ["copies", "copies/02.failed", "copies/02.ipynb"]
-    assert f"error: {(here / 'copies/02.failed').read_text().strip()}" == said.splitlines()[-1]
-    outputs = [output for cell in nbformat.read("copies/02.ipynb", 4).cells for output in cell.get("outputs", [])]
-    (error,) = [output for output in outputs if output.output_type == "error"]
-    assert "\n".join(error.traceback) == sentence
-
-
-def test_a_notebook_that_raises_keeps_its_traceback_in_place_of_an_older_copy(here, toy, capfd):
+def test_a_notebook_that_raises_keeps_its_traceback_in_place_of_an_older_copy_and_a_kernel_that_dies_is_told(here, toy, capfd):
     toy("good = 1\nbad = good / 0")
     (here / "02.ipynb").write_text("an older run")
     assert run.main(["02_offline_irl", "02.ipynb"]) == 1
-    assert "error: 02_offline_irl: ZeroDivisionError: division by zero (executed copy" in capfd.readouterr().err
+    said = capfd.readouterr().err.splitlines()[-1]
+    assert said == f"error: {(here / '02.failed').read_text().strip()}"
+    assert "02_offline_irl: ZeroDivisionError: division by zero (executed copy with the traceback: 02.ipynb)" in said
     (error,) = [output for cell in nbformat.read("02.ipynb", 4).cells for output in cell.get("outputs", [])]
     traceback = re.sub(r"\x1b\[[\d;]*m", "", "\n".join(error.traceback))
     assert "----> 2 bad = good / 0" in traceback
+    toy("import os\nos._exit(1)")
+    assert run.main(["02_offline_irl", "02.ipynb"]) == 1
+    assert "error: 02_offline_irl: the kernel died" in capfd.readouterr().err
     assert everything_below(here) == ["02.failed", "02.ipynb", "notebooks", "notebooks/02_offline_irl.ipynb"]
     toy("good = 1")
     assert run.main(["02_offline_irl", "02.ipynb"]) == 0
     assert everything_below(here) == ["02.ipynb", "notebooks", "notebooks/02_offline_irl.ipynb"]
-
-
-def test_a_kernel_that_dies_is_told(here, toy, capfd):
-    toy("import os\nos._exit(1)")
-    assert run.main(["02_offline_irl", "02.ipynb"]) == 1
-    assert "error: 02_offline_irl: the kernel died" in capfd.readouterr().err
 
 
 @pytest.mark.torture
@@ -193,9 +157,6 @@ def test_plain_papermill_refuses_a_misspelt_parameter(here):
     assert done.returncode != 0
     assert "notebooks/01_demonstrations.ipynb: there is no parameter 'sed'; the parameters are case, seed" in done.stderr
     assert everything_below(here) == ["01.ipynb"]
-
-
-# The order of the stages ---------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -252,45 +213,6 @@ def finished(plan):
     return plan
 
 
-ONE_SEED = {"demonstrations": 3, "offline": 5, "online": 2, "transfer": 1, "transfer_alone": 1, "report": 1}
-ONLINE = {rule: count for rule, count in ONE_SEED.items() if rule not in ("demonstrations", "offline")}
-STAGE = "results/smoke/seed_0/case_{}/{}/record.json"
-
-
-def test_the_whole_run_is_fourteen_jobs_with_all(plan):
-    assert plan() == ONE_SEED
-    assert sum(ONE_SEED.values()) + 1 == 14
-
-
-@SLOW
-def test_each_seed_repeats_the_stages(plan):
-    assert plan(seeds=2) == {rule: count if rule == "report" else 2 * count for rule, count in ONE_SEED.items()}
-
-
-@pytest.mark.parametrize(
-    ("target", "jobs"),
-    [
-        (STAGE.format(3, "transfer_printed"), {"demonstrations": 2, "offline": 1, "transfer_alone": 1}),
-        pytest.param(STAGE.format(2, "demonstrations"), {"demonstrations": 1}, marks=SLOW),
-        pytest.param(STAGE.format(2, "online_improved"), {"demonstrations": 1, "offline": 1, "online": 1}, marks=SLOW),
-        pytest.param(STAGE.format(3, "online_improved"), {"demonstrations": 2, "offline": 1, "transfer": 1}, marks=SLOW),
-    ],
-    ids=["transfer alone", "recording", "online", "transfer"],
-)
-def test_a_stage_asked_for_alone_runs_only_what_it_needs(plan, target, jobs):
-    assert plan(target) == jobs
-
-
-@pytest.mark.torture
-def test_finished_stages_are_skipped(finished):
-    assert finished() == {}
-    for path in (STAGE.format(2, "online_improved"), "report/report.html"):
-        (finished.folder / path).unlink()
-    assert finished() == {"online": 1, "report": 1}
-
-
-# What is made from what ------------------------------------------------------------------------------------------------
-
 RESULTS = {  # by rule of the Snakefile: the notebook, case and variant of each of its results
     "demonstrations": [("01_demonstrations", case, "improved") for case in (1, 2, 3)],
     "offline": [("02_offline_irl", case, variant) for case in (1, 2) for variant in ("improved", "printed")]
@@ -300,8 +222,40 @@ RESULTS = {  # by rule of the Snakefile: the notebook, case and variant of each 
     "transfer_alone": [("04_knowledge_transfer", 3, "printed")],
     "report": [("05_report", None, "improved")],
 }
-EVERYTHING = {rule: len(results) for rule, results in RESULTS.items()}
-LEARNT = {rule: number for rule, number in EVERYTHING.items() if rule != "report"}
+ONE_SEED = {rule: len(results) for rule, results in RESULTS.items()}
+LEARNT = {rule: number for rule, number in ONE_SEED.items() if rule != "report"}
+ONLINE = {rule: number for rule, number in ONE_SEED.items() if rule not in ("demonstrations", "offline")}
+STAGE = "results/smoke/seed_0/case_{}/{}/record.json"
+
+
+@pytest.mark.parametrize(
+    ("targets", "n_seeds", "jobs"),
+    [
+        ([], 1, ONE_SEED),
+        ([STAGE.format(3, "transfer_printed")], 1, {"demonstrations": 2, "offline": 1, "transfer_alone": 1}),
+        pytest.param([], 2, {rule: 2 * number for rule, number in LEARNT.items()} | {"report": 1}, marks=SLOW),
+        pytest.param([STAGE.format(2, "demonstrations")], 1, {"demonstrations": 1}, marks=SLOW),
+        pytest.param([STAGE.format(2, "online_improved")], 1, {"demonstrations": 1, "offline": 1, "online": 1}, marks=SLOW),
+        pytest.param([STAGE.format(3, "online_improved")], 1, {"demonstrations": 2, "offline": 1, "transfer": 1}, marks=SLOW),
+    ],
+    ids=["all", "transfer alone", "two seeds", "recording", "online", "transfer"],
+)
+def test_a_run_needs_each_stage_of_each_seed_and_a_stage_alone_only_what_it_reads(plan, targets, n_seeds, jobs):
+    assert plan(*targets, seeds=n_seeds) == jobs
+
+
+@pytest.mark.torture
+def test_finished_stages_are_skipped_and_what_is_damaged_or_gone_is_made_again(finished):
+    assert finished() == {}
+    record = finished.folder / STAGE.format(2, "online_improved")
+    record.write_text("{")
+    assert finished() == {"online": 1, "report": 1}
+    record.unlink()
+    (finished.folder / "report/report.html").unlink()
+    assert finished() == {"online": 1, "report": 1}
+    assert finished(missing=1) == {"report": 1}  # of the seeds that are whole, only when asked
+
+
 ADDED = None  # in place of words to replace: a line at the end
 PRINTED_IN_CASE = "variants: {printed: {weights: {step: {value: 0.1, unit: '-', source: a test, status: assumed}}}}\n"
 
@@ -316,13 +270,15 @@ def edited(text, old, new):
 
 EDITS = [
     ("params/case_2.yaml", "250", "249", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
-    ("params/case_2.yaml", ADDED, PRINTED_IN_CASE, {"offline": 1, "report": 1}),
+    ("params/case_3.yaml", ADDED, PRINTED_IN_CASE, {"transfer_alone": 1, "report": 1}),
     ("params/learning.yaml", "std_high: {value: 0.25", "std_high: {value: 0.3", ONLINE),
     ("params/learning.yaml", "episodes: {value: 400", "episodes: {value: 300", {"report": 1}),  # of another scale
     ("params/published.yaml", "21.63", "21.64", {"report": 1}),
+    ("notebooks/02_offline_irl.ipynb", '"seed = 0 ', '"seed = 1 ', {}),  # in the cell of parameters
     ("notebooks/04_knowledge_transfer.ipynb", "offline_response = ", "response_before = ", {"transfer": 1, "transfer_alone": 1}),
     ("src/helpers/learning/algorithm_2.py", ADDED, "# a comment\n", {}),
     ("src/helpers/learning/algorithm_2.py", '"""Algorithm 2', '"""The algorithm 2', {}),  # a docstring
+    ("src/helpers/evidence/mpc.py", ADDED, "x = 1\n", {}),  # behind none of these notebooks
     ("src/helpers/report/tables.py", "def ", "def _(): ...\n\n\ndef ", {"report": 1}),
     ("reports/template/report.md.jinja", "# The reproduction", "# A reproduction", {}),  # Snakemake looks at it by itself
     ("src/helpers/learning/algorithm_2.py", "return project(self.mean)", "return project(self.mean.clone())", LEARNT),
@@ -349,8 +305,7 @@ def test_a_change_makes_exactly_the_results_stale_that_are_made_from_it(source):
 @pytest.mark.parametrize(
     ("changed", "old", "new", "jobs"),
     [
-        ("params/case_2.yaml", "250", "249", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
-        pytest.param("src/helpers/learning/algorithm_2.py", ADDED, "# a comment\n", {}, marks=SLOW),
+        EDITS[0],
         pytest.param("src/helpers/learning/algorithm_2.py", "(self.mean)", "(+self.mean)", ONE_SEED, marks=SLOW),
         pytest.param("reports/template/report.md.jinja", "# The reproduction", "# A reproduction", {"report": 1}, marks=SLOW),
     ],
@@ -366,31 +321,24 @@ def test_what_is_stale_is_run_again_with_all_that_read_it(finished, changed, old
 
 
 @pytest.mark.torture
-def test_results_that_were_removed_are_made_again_whatever_else_has_changed(finished):
-    shutil.rmtree(finished.folder / "results")
-    path = finished.folder / "src/helpers/report/report.py"
-    path.write_text(path.read_text(encoding="utf-8").replace("RUNNERS = (", "RUNNERS = (*(),", 1), encoding="utf-8")
-    assert finished() == ONE_SEED
-
-
-@pytest.mark.torture
-@pytest.mark.parametrize("name", ["summary.md", "machine.md", "scaling.svg"])
-def test_what_make_bench_wrote_last_goes_into_the_report(finished, name):
+def test_what_make_bench_wrote_last_goes_into_the_report_and_results_that_were_removed_are_made_again(finished):
     folder = finished.folder / "reports/reference/benchmarks"
     folder.mkdir(parents=True)
-    (folder / name).touch()
-    assert finished() == {"report": 1}
-    os.utime(folder / name, (1000, 1000))
-    assert finished() == {}
+    for name in ("summary.md", "machine.md", "scaling.svg"):
+        (folder / name).touch()
+        assert finished() == {"report": 1}
+        os.utime(folder / name, (1000, 1000))
+        assert finished() == {}
+    shutil.rmtree(finished.folder / "results")
+    path = finished.folder / "src/helpers/report/report.py"
+    path.write_text(edited(path.read_text(encoding="utf-8"), "RUNNERS = (", "RUNNERS = (*(),"), encoding="utf-8")
+    assert finished() == ONE_SEED  # whatever else has changed
 
 
 @pytest.mark.torture
 @pytest.mark.parametrize(
     ("scale", "says"),
-    [
-        ("smoke", "\n1 notebook(s) failed; "),
-        pytest.param("huge", "\nNo notebook failed, what went wrong stands above; ", marks=SLOW),
-    ],
+    [("smoke", "\n1 notebook(s) failed; "), ("huge", "\nNo notebook failed, what went wrong stands above; ")],
     ids=["a parameter file", "the command"],
 )
 def test_the_summary_tells_what_was_refused_before_it_ran(plan, scale, says):
@@ -405,17 +353,3 @@ def test_the_summary_tells_what_was_refused_before_it_ran(plan, scale, says):
     assert says in done.stderr
     said = done.stderr[done.stderr.index(says) :]
     assert ("case_2.yaml: " in said) is (scale == "smoke")
-
-
-@pytest.mark.torture
-def test_a_damaged_record_is_made_again(finished):
-    (finished.folder / STAGE.format(2, "online_improved")).write_text("{")
-    assert finished() == {"online": 1, "report": 1}
-
-
-@pytest.mark.torture
-def test_a_report_of_the_seeds_that_are_whole_is_made_only_when_asked(finished):
-    (finished.folder / STAGE.format(2, "online_improved")).unlink()
-    (finished.folder / "report/report.html").unlink()
-    assert finished(missing=1) == {"report": 1}
-    assert finished() == {"online": 1, "report": 1}

@@ -1,7 +1,6 @@
 """Which modules stand behind a notebook, against what Python itself imports."""
 
 import ast
-import json
 import subprocess
 import sys
 
@@ -61,34 +60,3 @@ def test_imports_inside_functions_and_of_the_package_count():
     expected = {"helpers", "helpers.learning", "helpers.learning.lstm", "helpers.quick"}
     expected |= {"helpers.plant", "helpers.plant.task", "helpers.plant.task.ControlTask"}
     assert set(sources._imported(code)) == expected
-
-
-@pytest.fixture
-def project(tmp_path):
-    """A project of one notebook, a module behind it and one that is not."""
-    for folder in ("src/helpers/room", "src/helpers/report", "notebooks"):
-        (tmp_path / folder).mkdir(parents=True)
-    (tmp_path / "src/helpers/room/__init__.py").write_text('"""A room."""\n')
-    (tmp_path / "src/helpers/room/idle.py").write_text("y = 1\n")
-    (tmp_path / "src/helpers/report/figures.py").write_text("from helpers.room import idle\n")
-
-    def write(verb="x = 1\n", cell="from helpers.room import verb, nothing\nfrom helpers.report import figures\n", seed="seed = 0"):
-        cells = [
-            {"cell_type": "code", "source": [source], "outputs": [], "metadata": {"tags": tags}}
-            for source, tags in ((seed, ["parameters"]), (cell, []))
-        ]
-        (tmp_path / "notebooks/01.ipynb").write_text(json.dumps({"cells": cells}), encoding="utf-8")
-        (tmp_path / "src/helpers/room/verb.py").write_text(verb, encoding="utf-8")
-        return sources.code_behind("01", tmp_path)
-
-    return write
-
-
-def test_the_code_behind_a_notebook_is_named_and_hashed_without_comments_and_parameters(project):
-    first = project()
-    assert sorted(first) == ["notebooks/01.ipynb", "src/helpers/room/__init__.py", "src/helpers/room/verb.py"]
-    assert project("x = 1  # one\n\n", seed="seed = 1") == first
-    assert project('"""What it does."""\nx = 1\n') == first
-    assert project("x = 2\n") == first | {"src/helpers/room/verb.py": project("x = 2\n")["src/helpers/room/verb.py"]} != first
-    assert project(cell="from helpers.room import verb\nverb.x\n")["src/helpers/room/verb.py"] == first["src/helpers/room/verb.py"]
-    assert project(cell="from helpers.room import verb\nverb.x\n") != first

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from helpers.runs.opening import parameters_hash
-from helpers.runs.request import SessionError, check_parameters
-from helpers.settings.leaf import ParameterError, read_yaml
+from helpers.settings.leaf import read_yaml
 from helpers.settings.paper import TrialParams, load, load_trials
 from tests.runs.test_study import session
 from tests.settings.test_params import DELETE, edit, folder, leaf, refusal  # noqa: F401  (a fixture)
@@ -39,15 +38,19 @@ def test_a_trial_is_its_base_but_for_the_leaves_that_the_file_names(root):
         assert changed == given, name
 
 
-def test_trials_leave_the_variants_the_leaves_and_their_hash_alone(folder, root):  # noqa: F811
+def test_trials_leave_the_variants_the_leaves_and_their_hash_alone_which_changes_with_values_only(folder, root):  # noqa: F811
     edit(folder / TRIALS, {"undamped_weights.weights.decay.value": 0.2})
     before, after = load(root, 1), load(folder, 1)
     assert after.leaves == before.leaves
     assert not [row for row in after.leaves if row["file"] == TRIALS]
-    assert parameters_hash(after) == parameters_hash(before)
     assert after.learning.variants["undamped_weights"].weights.decay == 0.2
     (folder / TRIALS).write_text("{}\n")
     assert load(folder, 1).learning.variants == {name: before.learning.variants[name] for name in ("improved", "printed")}
+    hashes = []
+    for part, value in (("source", "a book"), ("source", "thought about"), ("value", 0.02)):
+        edit(folder / "learning.yaml", {f"policy.leaky_slope.{part}": value})
+        hashes.append(parameters_hash(load(folder, 1)))
+    assert hashes[0] == hashes[1] != hashes[2]
 
 
 def test_a_case_may_change_a_variant_and_no_other_case_sees_it(folder, root):  # noqa: F811
@@ -61,29 +64,7 @@ def test_a_case_may_change_a_variant_and_no_other_case_sees_it(folder, root):  #
     assert own.variants["constant_step"] == before.variants["constant_step"]  # a trial changes the variant of learning.yaml
 
 
-@pytest.mark.parametrize(
-    ("variants", "key", "says"),
-    [
-        ({"best": {"weights": {}}}, "variants.best", "improved, printed"),
-        ({"printed": 3}, "variants.printed", "keys and values"),
-        ({"printed": {"weights": {"pace": leaf(0.1)}}}, "variants.printed.weights.pace", "unknown"),
-        ({"printed": {"learner": {"minibatches": leaf(41, "per pass")}}}, "variants.printed.learner.minibatches", "40 episodes"),
-    ],
-)
-def test_a_wrong_variant_of_a_case_is_named(folder, variants, key, says):  # noqa: F811
-    edit(folder / "case_2.yaml", {"variants": variants})
-    with pytest.raises(ParameterError) as caught:
-        load(folder, 2)
-    for word in ("case_2.yaml", f"'{key}'", says):
-        assert word in str(caught.value)
-
-
-def test_the_headline_variant_uses_none_of_the_optional_settings(root):
-    for case in (1, 2, 3):
-        variant = load(root, case).learning.variants["improved"]
-        assert (variant.exploration, variant.episodes, variant.learner.entropy) == (None, None, 0)
-
-
+MANY = leaf(41, "per pass")
 REFUSED = [
     ({"constant_step.base": "best"}, "constant_step.base", "improved, printed"),
     ({"constant_step.base": "whole_return"}, "constant_step.base", "improved, printed"),
@@ -97,50 +78,28 @@ REFUSED = [
     ({"constant_step.learner.learning_rate_end.value": 2.0}, "constant_step.learner.learning_rate_end", "less than or equal to 1"),
     ({"constant_step.learner.learning_rate_end.unit": "s"}, "constant_step.learner.learning_rate_end", "unit"),
     ({"constant_step.learner.rate": leaf(0.1)}, "constant_step.learner.rate", "unknown"),
-    ({"constant_step.learner.minibatches": leaf(41, "per pass")}, "constant_step.learner.minibatches", "40 episodes"),
+    ({"constant_step.learner.minibatches": MANY}, "constant_step.learner.minibatches", "40 episodes"),
     ({"constant_step.learner.entropy": leaf(-0.1)}, "constant_step.learner.entropy", "greater than or equal to 0"),
     ({"improved": {"base": "printed", "title": "a", "family": "credit", "weights": {"step": leaf(0.1)}}}, "improved", "other than"),
-    ({"best/of": {"base": "printed"}}, "best/of", "small letters"),
+    ({"variants": {"best": {"weights": {}}}}, "variants.best", "improved, printed"),
+    ({"variants": {"printed": 3}}, "variants.printed", "keys and values"),
+    ({"variants": {"printed": {"weights": {"pace": leaf(0.1)}}}}, "variants.printed.weights.pace", "unknown"),
+    ({"variants": {"printed": {"learner": {"minibatches": MANY}}}}, "variants.printed.learner.minibatches", "40 episodes"),
 ]
 
 
-@pytest.mark.parametrize(("changes", "key", "says"), REFUSED, ids=[str(list(changes)) + says for changes, _, says in REFUSED])
-def test_a_wrong_trial_is_named(folder, changes, key, says):  # noqa: F811
-    edit(folder / TRIALS, changes)
-    sentence = refusal(folder)
-    assert TRIALS in sentence, sentence
-    assert f"'{key}'" in sentence, sentence
-    assert says in sentence, sentence
+@pytest.mark.parametrize(("changes", "key", "says"), REFUSED, ids=[f"{key} {says}" for _, key, says in REFUSED])
+def test_a_wrong_trial_or_variant_of_a_case_is_named(folder, changes, key, says):  # noqa: F811
+    file = "case_2.yaml" if "variants" in changes else TRIALS
+    edit(folder / file, changes)
+    sentence = refusal(folder, case=2)
+    assert all(part in sentence for part in (file, f"'{key}'", says)), sentence
 
 
-def test_a_missing_or_empty_file_is_named(folder):  # noqa: F811
-    (folder / TRIALS).write_text("# none\n")
-    assert TRIALS in refusal(folder)
-    (folder / TRIALS).unlink()
-    assert "trials.yaml: the parameter file is missing" in refusal(folder)
-
-
-def test_an_unknown_variant_is_refused_without_the_whole_list():
-    with pytest.raises(SessionError) as caught:
-        check_parameters("02_offline_irl", {"variant": "best"})
-    assert str(caught.value).endswith("expected one of improved, printed, a trial of params/trials.yaml, found 'best'")
-
-
-# Run at smoke scale
-
-
-def imitated(run):
-    return run.imitate(run.load_demonstrations(), run.fresh_policy())
-
-
-@pytest.fixture(scope="module")
-def improved():
-    return imitated(session())
-
-
-def test_a_trial_meets_the_random_numbers_of_its_base(improved):
+def test_a_trial_meets_the_random_numbers_of_its_base():
     """So where only what is kept in the end was changed, learning itself is the same."""
-    trial = imitated(session(variant="unaveraged_policy"))
-    assert trial.records == improved.records
-    kept = zip(trial.policy.parameters(), improved.policy.parameters(), strict=True)
+    runs = session(), session(variant="unaveraged_policy")
+    base, trial = (run.imitate(run.load_demonstrations(), run.fresh_policy()) for run in runs)
+    assert trial.records == base.records
+    kept = zip(trial.policy.parameters(), base.policy.parameters(), strict=True)
     assert not all(torch.equal(mine, its) for mine, its in kept)

@@ -4,6 +4,7 @@ import copy
 import json
 import re
 import shutil
+from functools import cache
 from itertools import product
 
 import pandas as pd
@@ -216,10 +217,13 @@ def inputs(tmp_path, monkeypatch):
     return shutil.copytree(INPUTS, tmp_path / "inputs")
 
 
+inputs_now = cache(identity.inputs)
+
+
 def origin(notebook, case, seed, variant="improved", upstream=None):
     """The part of a record that says where a result comes from, as if it had been made now."""
     run = {"notebook": notebook, "case": case, "seed": seed, "scale": "smoke", "variant": variant}
-    made_from, upstream = identity.inputs(notebook, PARAMS, "smoke", case, variant), upstream or {}
+    made_from, upstream = inputs_now(notebook, PARAMS, "smoke", case, variant), upstream or {}
     return run | {"inputs": made_from, "upstream": upstream, "identity": identity.identity(run, made_from, upstream)}
 
 

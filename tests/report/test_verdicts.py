@@ -29,7 +29,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_the_verdicts_follow_from_the_numbers_of_single_seeds(folder, capsys):
+def test_the_verdicts_follow_from_the_numbers_of_single_seeds_and_one_that_does_not_is_named(folder, capsys):
     claims = pd.read_csv(folder / "tables/claims.csv").set_index(["id", "case"])
     first = claims.loc[("hot_start_outcome", 1)].iloc[0]
     assert (first["n"], first["median"], first["verdict"]) == (6, 1.0, "holds")
@@ -38,9 +38,6 @@ def test_the_verdicts_follow_from_the_numbers_of_single_seeds(folder, capsys):
     pd.testing.assert_frame_equal(again, published, rtol=1e-8)
     assert main([str(folder)]) == 0
     assert "54 of 54 verdicts" in capsys.readouterr().out
-
-
-def test_a_verdict_that_does_not_follow_is_named(folder, capsys):
     path = folder / "tables/claims.csv"
     path.write_text(path.read_text(encoding="utf-8").replace(",holds,the whole", ",does not hold,the whole", 1), encoding="utf-8")
     assert main([str(folder)]) == 1

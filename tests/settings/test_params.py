@@ -59,9 +59,6 @@ def refusal(folder, case=1):
     return sentence
 
 
-# What the committed files hold
-
-
 @pytest.mark.parametrize(
     ("case", "epochs", "iterations", "demonstrator"), [(1, 300, 4, "PID1"), (2, 250, 3, "PID2"), (3, 80, 1, "PID1")]
 )
@@ -133,9 +130,7 @@ def test_numbers_may_be_written_as_people_write_them(folder, text, expected):
     assert load(folder, 1).process.sampling_time == expected
 
 
-# Mistakes: file, key, new values, and what the sentence must say of each of them
-
-VALUES = [
+VALUES = [  # mistakes: file, key, new values, and what the sentence must say of each of them
     # mistyped
     ("process.yaml", "sampling_time", ["1e-3", True, None, [0.04]], "number"),
     ("process.yaml", "horizon", [50.0, True, "50"], "integer"),
@@ -268,8 +263,6 @@ def test_a_key_that_stands_twice_or_is_no_word_is_named(folder, old, new, says):
     sentence = refusal(folder)
     assert all(part in sentence for part in ("features.yaml", *says)), sentence
 
-
-# Files that are no parameter files
 
 CONTENTS = {
     "empty": b"",

@@ -10,7 +10,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from helpers.evidence.identification import Fit, Problem, Profile, polish, profile, refit, search, steps
-from helpers.evidence.readings import GAINS, MAIN, TIME, Reading, ReadProcess, exact_drift, simulate, with_settings
+from helpers.evidence.readings import GAINS, MAIN, READINGS, TIME, Reading, ReadProcess, exact_drift, simulate, with_settings
 from helpers.plant.process import LinearProcess
 from helpers.plant.rollout import rollout, stream
 from helpers.runs.request import PROJECT
@@ -188,6 +188,7 @@ def test_what_the_controller_sees_and_what_the_types_are_taken_of():
     of_x, of_y = features(MAIN), features(Reading(features_on="y"))
     assert features(Reading(accumulated_on="y")).equal(torch.cat([of_x[:, :2], of_y[:, 2:4], of_x[:, 4:]], 1))
     assert features(Reading(rate_on="y")).equal(torch.cat([of_x[:, :4], of_y[:, 4:]], 1))
+    assert len({reading.name for reading in READINGS}) == len({replace(reading, name="") for reading in READINGS}) == len(READINGS)
 
 
 def test_an_unstable_loop_costs_much_and_stays_finite():

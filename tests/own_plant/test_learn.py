@@ -133,6 +133,7 @@ def test_a_policy_that_does_not_agree_or_a_full_disk_leaves_what_was_there(tmp_p
     (output / "report.md").write_text("old", encoding="utf-8")
     arguments = [str(MadeUpPlant(1, 1).write(tmp_path)), "--scale", "smoke", "--params", str(quick_root), "--output", str(output)]
     monkeypatch.setattr(plant_report, "pass_gate", lambda *given: replace(learn.pass_gate(*given), released=True))
+    monkeypatch.setattr(plant_report, "export_c", lambda *_: None)
     monkeypatch.setattr(plant_report, "disagreement", lambda *_: np.nan)
     assert plant_report.main(arguments) == 2
     assert "the exported policy differs from the learned one by nan" in capsys.readouterr().err
@@ -186,14 +187,14 @@ def test_a_few_episodes_of_the_plant_change_the_policy_only_for_a_better_one(ope
 
 def test_the_description_the_command_and_the_loop_of_the_docs_are_read_and_run_as_they_stand(tmp_path, quick_root, monkeypatch):
     page = (PROJECT / "docs/your_own_plant.md").read_text(encoding="utf-8")
-    blocks = (re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL) for language in ("yaml", "sh", "python"))
-    (yaml,), (shell,), (python,) = blocks
+    (yaml,), (shell,), (python,) = (re.findall(rf"```{kind}\n(.*?)```", page, re.DOTALL) for kind in ("yaml", "sh", "python"))
     (tmp_path / "plant.yaml").write_text(yaml, encoding="utf-8")
     assert load_description(tmp_path / "plant.yaml").columns == ("TIME", "MODE", "TC1.PV", "TC1.OP", "TC1.SP")
     words = shlex.split(shell, comments=True)
     assert f"{shlex.join(words)}\n" in (PROJECT / "README.md").read_text(encoding="utf-8")  # which shows the same
     assert words[:4] == [".venv/bin/python", "-m", "helpers", "plant"]
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(plant_report, "export_c", lambda static, path: path.touch())  # takes seconds; tested in test_deploy.py
     monkeypatch.setattr(plant_report, "pass_gate", lambda *given: replace(learn.pass_gate(*given), released=True))
     (tmp_path / "notebooks/plant").mkdir(parents=True)
     shutil.copy(PROJECT / "notebooks/plant/tank.yaml", tmp_path / "notebooks/plant")

@@ -80,6 +80,7 @@ def test_the_committed_file_begins_and_ends_as_it_would_be_written_now(root):
     settings = tank_params.history
     written = pd.read_csv(FILE, na_values=BAD)
     assert len(written) > 10_000
+    assert FILE.stat().st_size < 1e6
 
     def recorded_again(first, last):
         generator = stream(0, "tank history")

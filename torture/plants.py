@@ -1,8 +1,8 @@
 """Plants that taught no controller: each is recorded under its PI, learned from its file, and judges what comes out.
 
-`make plants` does so for five seeds and writes reports/reference/plants.csv and plants.md; what is there is not run again. The
-plant as recorded, and plants with 0.7 or 1.3 times its gain and its time constants and a sample more of dead time, play episodes
-with set points over the recorded range and a load step.
+`make plants` does so for five seeds and writes reports/reference/plants.csv and plants.md; what is there of the same commit is
+not run again. The plant as recorded, and plants with 0.7 or 1.3 times its gain and its time constants and a sample more of dead
+time, play episodes with set points over the recorded range and a load step.
 """
 
 import argparse
@@ -29,6 +29,7 @@ from helpers.own_plant import gate, learn, online
 from helpers.plant.rollout import stream
 from helpers.plant.tracking import Bounds, track
 from helpers.runs.artifacts import code_revision
+from helpers.runs.scratch import beside
 from helpers.runs.sources import PROJECT
 
 FOUND = PROJECT / "reports/reference"
@@ -147,15 +148,14 @@ def record(plant: Loops, seed: int) -> pd.DataFrame:
 
 def description(name: str, plant: Loops) -> dict[str, Any]:
     """The description of a plant and its historian file."""
-    controlled = [
-        {"name": f"y{i}", "tag": f"Y{i}", "unit": "degC", "low": 0.0, "high": 150.0, "steady_state": 75.0, "set_point": 75.0}
-        for i in range(plant.n_outputs)
-    ]
-    for variable in controlled:
-        variable["error_scale"] = 1.0
-    for (output, *_), high in zip(plant.loops, plant.high, strict=True):
-        controlled[output] |= {"set_point_tag": f"SP{output}", "set_point": 75.0 + high}
-        del controlled[output]["error_scale"]
+    tracked = dict(zip((loop[0] for loop in plant.loops), plant.high, strict=True))
+    measured = {"unit": "degC", "low": 0.0, "high": 150.0, "steady_state": 75.0}
+    controlled: list[dict[str, Any]] = []
+    for i in range(plant.n_outputs):
+        aim = (
+            {"set_point_tag": f"SP{i}", "set_point": 75.0 + tracked[i]} if i in tracked else {"set_point": 75.0, "error_scale": 1.0}
+        )
+        controlled.append({"name": f"y{i}", "tag": f"Y{i}", **measured, **aim})
     entry = {"unit": "%", "low": 0.0, "high": 100.0, "steady_state": 50.0}
     manipulated = [{"name": f"u{j}", "tag": f"U{j}", **entry} for j in range(plant.n_inputs)]
     pid = [{"controlled": f"y{i}", "manipulated": f"u{j}", "proportional": p, "integral": k} for i, j, p, k in plant.loops]
@@ -225,18 +225,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--cores", type=int, default=2)
     given = parser.parse_args(arguments)
-    path = FOUND / "plants.csv"
-    found = pd.read_csv(path) if path.is_file() else pd.DataFrame({"plant": [], "seed": []})
+    path, revision = FOUND / "plants.csv", code_revision(PROJECT)
+    found = pd.read_csv(path) if path.is_file() else pd.DataFrame({"plant": [], "seed": [], "revision": []})
+    found = found[found["revision"] == revision]
     done = set(zip(found["plant"], found["seed"], strict=True))
     waiting = [(name, seed) for seed in range(given.seeds) for name in PLANTS if (name, seed) not in done]
     with ProcessPoolExecutor(given.cores) as pool:
         for rows in pool.map(judged, *zip(*waiting, strict=True)) if waiting else ():
-            found = pd.concat([found, rows], ignore_index=True)
-            found.to_csv(path, index=False, float_format="%.6g")
+            found = pd.concat([found, rows.assign(revision=revision)], ignore_index=True)
+            found.to_csv(beside(path), index=False, float_format="%.6g")
+            beside(path).replace(path)
             print(f"{rows['plant'][0]}, seed {rows['seed'][0]}: {rows['seconds'][0]:.0f} s, keep: {rows['keep'][0]}", flush=True)
     words = (
         "# Plants that taught no controller",
-        f"Written by `make plants` at `{code_revision(PROJECT)}`: medians over {given.seeds} seeds; mean abs(e) and movement are "
+        f"Written by `make plants` at `{revision}`: medians over {given.seeds} seeds; mean abs(e) and movement are "
         "shares of those of the PI of the record, over set points of the whole range and a load step.",
         summary(found),
     )

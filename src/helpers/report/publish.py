@@ -31,6 +31,7 @@ GLANCE = {  # of tables/gaps.csv, and its headers in README
     "online_share": "online objective, share of minimum variance",
 }
 ENDS = {"median": "", "ci_low": "_low", "ci_high": "_high"}
+APART = ("benchmarks", "inferred_settings", "plants.csv", "plants.md", "reliability.md", "search")  # runs of their own, which stay
 PARTS = ("report.html", "report.pdf", "report.md", "figures", "tables", "comparison.csv", "seeds.csv", "provenance.json")
 
 
@@ -168,14 +169,7 @@ def publish() -> None:
         target.write_text(relinked(target.read_text(encoding="utf-8")), encoding="utf-8")
     if (first / "inferred_settings").is_dir():
         _copy(first / "inferred_settings", partial / "inferred_settings")
-    for part in (
-        "benchmarks",
-        "inferred_settings",
-        "plants.csv",
-        "plants.md",
-        "reliability.md",
-        "search",
-    ):  # runs of their own, which stay
+    for part in APART:
         if (REFERENCE / part).exists() and not (partial / part).exists():
             _copy(REFERENCE / part, partial / part)
     if REFERENCE.exists():

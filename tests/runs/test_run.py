@@ -258,7 +258,6 @@ def test_finished_stages_are_skipped_and_what_is_damaged_or_gone_is_made_again(f
 
 
 ADDED = None  # in place of words to replace: a line at the end
-PRINTED_IN_CASE = "variants: {printed: {weights: {step: {value: 0.1, unit: '-', source: a test, status: assumed}}}}\n"
 
 
 def edited(text, old, new):
@@ -271,7 +270,7 @@ def edited(text, old, new):
 
 EDITS = [
     ("params/case_2.yaml", "250", "249", {"demonstrations": 1, "offline": 2, "online": 1, "report": 1}),
-    ("params/case_3.yaml", ADDED, PRINTED_IN_CASE, {"transfer_alone": 1, "report": 1}),
+    ("params/case_3.yaml", "_start: {value: 0.", "_start: {value: 0.1", {"transfer_alone": 1, "report": 1}),
     ("params/learning.yaml", "std_high: {value: 0.25", "std_high: {value: 0.3", ONLINE),
     ("params/learning.yaml", "episodes: {value: 400", "episodes: {value: 300", {"report": 1}),  # of another scale
     ("params/published.yaml", "21.63", "21.64", {"report": 1}),

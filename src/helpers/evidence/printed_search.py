@@ -168,10 +168,11 @@ class Search:
         Settings are ranked by the median of their gaps over the seeds of a rung. The first, that by hand, takes part to the end.
         """
         size, ranked = self.size, list(range(len(self.settings)))
+        n_last = size.last[min(case, len(size.last)) - 1]
         names = feature_names(load(self.root, case).process.controlled)
         rows: dict[tuple[int, int], Setting] = {}
         for rung, (n_settings, n_seeds) in enumerate(
-            ((len(ranked), 1), (size.finalists, size.finalist_seeds), (size.last, size.seeds))
+            ((len(ranked), 1), (size.finalists, size.finalist_seeds), (n_last, size.seeds))
         ):
             tried = sorted({0, *ranked[:n_settings]})
             for number, seed in product(tried, range(n_seeds)):

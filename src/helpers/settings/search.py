@@ -44,12 +44,15 @@ class SettingParams(Record):
 
 
 class SearchScaleParams(Record):
-    """How much is searched: settings for one seed, the best for a few, the `last` of them for all; and the sample of weights."""
+    """How much is searched: settings for one seed, the best for a few, the `last` of them for all; and the sample of weights.
+
+    `last` has an entry a case; of further cases the final one holds.
+    """
 
     settings: Annotated[Count, Leaf("settings")]
     finalists: Annotated[Count, Leaf("settings")]
     finalist_seeds: Annotated[Count, Leaf("seeds")]
-    last: Annotated[Count, Leaf("settings")]
+    last: Annotated[tuple[Count, ...], Field(min_length=1), Leaf("settings")]
     seeds: Annotated[Count, Leaf("seeds")]
     batches: Annotated[Count, Leaf("batches")]
     anywhere: Annotated[Count, Leaf("weights a batch")]

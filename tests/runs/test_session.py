@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import time
 
 import pandas as pd
 import pytest
@@ -164,6 +165,17 @@ def test_a_saved_stage_records_where_it_comes_from(tmp_path):
     loaded = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, seed=4, input_root=str(tmp_path))).load("offline_improved", "02")
     assert loaded.record == record
     assert loaded.table("t.csv").equals(table)  # display options, which a session sets, do not reach the files
+
+
+def test_the_seconds_of_the_results_of_one_run_add_up_to_its_own(tmp_path):
+    session, began = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, output_root=str(tmp_path))), time.process_time()
+    first = session.save("offline_improved", {"t.csv": pd.DataFrame({"value": [1.0]})}, last=False).record["seconds"]
+    while time.process_time() < began + 0.2:
+        pass
+    second = session.save("offline_printed", {"t.csv": pd.DataFrame({"value": [1.0]})}).record["seconds"]
+    assert first > 0
+    assert second > 0.1
+    assert first + second <= time.process_time() - session.clock[0]
 
 
 def test_a_run_under_which_code_or_parameters_change_saves_nothing(tmp_path):

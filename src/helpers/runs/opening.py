@@ -37,6 +37,7 @@ class Run:
     Attributes:
         made_from: `identity.inputs` as they were when the run began.
         upstream: the earlier results that it read, by folder, and the hash of their files.
+        clock: processor time in seconds at the beginning and at each result.
     """
 
     notebook: str
@@ -47,7 +48,7 @@ class Run:
     params_root: Path
     made_from: Mapping[str, str]
     upstream: dict[str, str] = field(default_factory=dict)
-    started: float = field(default_factory=time.perf_counter)
+    clock: list[float] = field(default_factory=lambda: [time.process_time()])
 
     @property
     def given(self) -> dict[str, Any]:
@@ -77,12 +78,13 @@ class Run:
         if changed := changes({"inputs": self.made_from}, self.inputs_now()):
             raise SessionError(f"notebooks/{self.notebook}.ipynb: {', '.join(changed)} changed during the run; run it again")
         run = {"notebook": self.notebook, **self.given}
+        self.clock.append(time.process_time())
         return {
             **run,
             "identity": identity(run, self.made_from, self.upstream),
             "inputs": dict(self.made_from),
             "upstream": dict(self.upstream),
-            "seconds": time.perf_counter() - self.started,
+            "seconds": self.clock[-1] - self.clock[-2],  # since the result before, so that those of a run add up to its time
             "revision": artifacts.code_revision(PROJECT),
             "versions": versions(),
         }

@@ -174,6 +174,17 @@ def test_what_cannot_end_well_is_refused_before_learning(changes, output, status
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(("worse", "share"), [(1.0, 1.0), (-1.0, 2.0**-online.HALVINGS)])
+def test_the_disturbance_is_halved_until_the_exploring_episodes_are_hardly_ever_worse(opened, worse, share):
+    plant = opened(1, 1)
+    identified, _ = learn.identify_plant(plant)
+    settings = plant.params.online.model_copy(update={"worse": 2 * worse})
+    workshop = learn.open_workshop(replace(plant, params=plant.params.model_copy(update={"online": settings})), identified)
+    policy, _ = learn.learn_policy(workshop, workshop.record)
+    size = online.gentle(workshop, policy, plant.stream("a test"))
+    assert torch.equal(size, share * settings.disturbance * workshop.operation.bounds.span)
+
+
 def test_a_few_episodes_of_the_plant_change_the_policy_only_for_a_better_one(opened):
     plant = opened(1, 1)
     identified, _ = learn.identify_plant(plant)

@@ -236,7 +236,8 @@ def learn_policy(
     def measure(scenarios: Scenarios, run: Tracked) -> tuple[Tensor, Tensor]:
         error, movement = operation.figures(workshop.record, scenarios)
         share = operation.error(run) / error
-        return share + HARM * (share - 1).clamp(min=0), operation.movement(run) / movement / params.movement
+        # The record's PID may rest at a bound in an episode: its mean movement is what the gate compares with too.
+        return share + HARM * (share - 1).clamp(min=0), operation.movement(run) / movement.mean() / params.movement
 
     descent = Descent(plant.epochs(params.steps))
     records = model_gradient(

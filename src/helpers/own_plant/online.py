@@ -17,6 +17,7 @@ from helpers.plant.process import Process
 from helpers.plant.tracking import Scenarios, Tracker
 
 CAREFUL = 0.9  # share of the allowed movement that the policy is given to learn with
+HALVINGS, REHEARSED = 8, 400  # of the disturbance, at most; episodes of the model to choose it by
 FIGURES = ("mean |e|", "movement", "offset")
 PLACES = (0.0, 0.5, 1.0)  # of the set points of a loop within its range; every combination of those of all loops is judged
 
@@ -77,12 +78,28 @@ def plant_episodes(workshop: Workshop, process: Process, n_episodes: int, genera
     return from_rest(process, drawn.set_point, drawn.load, generator)
 
 
+def gentle(workshop: Workshop, policy: TrackingPolicy, generator: torch.Generator) -> Tensor:
+    """The disturbance of the inputs, (n_u,): the given one, halved until few episodes are worse than the record's PID's.
+
+    They are rehearsed on the model; few are half of the allowed share, since the plant is not the model.
+    """
+    operation, params = workshop.operation, workshop.plant.params.online
+    rehearsal, size = plant_episodes(workshop, workshop.nominal, REHEARSED, generator), params.disturbance * operation.bounds.span
+    recorded, _ = operation.figures(workshop.record, rehearsal)
+    for _ in range(HALVINGS):
+        error, _ = operation.figures(Exploring(policy, size, generator), rehearsal)
+        if (error > recorded).double().mean() <= params.worse / 2:
+            break
+        size = size / 2
+    return size
+
+
 def improve_on_plant(workshop: Workshop, identified: Identified, policy: TrackingPolicy, process: Process) -> Improvement:
     """`explore` + 2 `test` episodes of the plant; the policy that is given stays unless a paired test finds a better one."""
     plant, operation, params = workshop.plant, workshop.operation, workshop.plant.params.online
     generator = plant.stream("plant episodes")
     explored = plant_episodes(workshop, process, params.explore, generator)
-    run = operation.run(Exploring(policy, params.disturbance * operation.bounds.span, generator), explored)
+    run = operation.run(Exploring(policy, gentle(workshop, policy, plant.stream("rehearsal")), generator), explored)
     recorded, _ = operation.figures(workshop.record, explored)
     worse = (operation.error(run) > recorded).double().mean().item()
     pieces = [Stretch(y.double().numpy(), u.double().numpy()) for y, u in zip(run.y[:-1].unbind(1), run.u.unbind(1), strict=True)]

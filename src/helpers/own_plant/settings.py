@@ -90,6 +90,7 @@ class PlantOnlineParams(Record):
     explore: Annotated[Count, Leaf("episodes")]
     test: Annotated[Count, Leaf("episodes")]
     disturbance: Annotated[Share, Leaf("input range")]
+    worse: Annotated[Share, Leaf("share")]
     level: Annotated[Share, Leaf("-")]
 
 

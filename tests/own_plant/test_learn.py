@@ -152,7 +152,6 @@ def test_a_policy_that_does_not_agree_or_a_full_disk_leaves_what_was_there(tmp_p
 @pytest.mark.parametrize(
     ("changes", "output", "status", "says"),
     [
-        ({"horizon": 300}, "out", 2, "error: plant.csv: 0 episodes of 300 samples"),
         ({"time_unit": "week"}, "out", 2, "key 'time_unit'"),
         ({"plant": "gymnasium:NoSuch-v0"}, "out", 2, "plant 'gymnasium:NoSuch-v0': "),
         ({}, "plant.yaml/out", 1, "plant.yaml"),
@@ -172,6 +171,15 @@ def test_what_cannot_end_well_is_refused_before_learning(changes, output, status
     assert says in sentence
     assert sentence.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_a_record_with_too_few_episodes_of_one_task_costs_the_weights_only(opened):
+    plant = opened(1, 1)
+    workshop = learn.open_workshop(plant, learn.identify_plant(plant)[0])
+    longer = replace(plant, description=plant.description.model_copy(update={"horizon": 300}))
+    found, (words,) = plant_report.offline(longer, workshop)
+    assert found == {}
+    assert words.startswith("the weights of the record's controller were not found: plant.csv: 0 episodes of 300 samples")
 
 
 @pytest.mark.parametrize(("worse", "share"), [(1.0, 1.0), (-1.0, 2.0**-online.HALVINGS)])

@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from helpers.learning.model_gradient import Descent, GradientRecord, model_gradi
 from helpers.learning.tracking_policy import Gains, TrackingPID, TrackingPolicy
 from helpers.own_plant import gate
 from helpers.own_plant.description import PlantDescription, load_description
-from helpers.own_plant.episodes import Episodes, episodes, stretches
+from helpers.own_plant.episodes import Episodes, comes_near, episodes, stretches
 from helpers.own_plant.identify import Identified, Validation, hold_out, identify, thin_out, validate_model
 from helpers.own_plant.model import ArmaxModel
 from helpers.own_plant.operation import Operation, described_gains, draw_scenarios, operation, recorded_gains
@@ -41,7 +42,7 @@ SLACK, BEYOND = 0.95, 10.0  # share of the allowed movement that is aimed at, an
 
 @dataclass(frozen=True)
 class OwnPlant:
-    """A plant, its clean record, its demonstrations of one task, and how to learn from them.
+    """A plant, its clean record, and how to learn from it.
 
     Attributes:
         params: of params/own_plant.yaml. base: of the paper's learning, which is used as it is. scale: how much is computed.
@@ -53,7 +54,15 @@ class OwnPlant:
     scale: ScaleParams
     seed: int
     clean: CleanRecords
-    demonstrations: Episodes
+
+    @cached_property
+    def demonstrations(self) -> Episodes:
+        """Those of the task of the description; only Algorithm 2 needs them.
+
+        Raises:
+            InputError: if the record has too few.
+        """
+        return episodes(self.clean, self.description, self.params.quality, self.dtype)
 
     @property
     def dtype(self) -> torch.dtype:
@@ -90,7 +99,7 @@ class OwnPlant:
 
 
 def open_plant(path: Path, params_root: Path, scale: str, seed: int, params: Params | None = None) -> OwnPlant:
-    """Read a plant's description and its historian file, and find its demonstrations.
+    """Read a plant's description and its historian file.
 
     Raises:
         InputError: in one sentence, if the files cannot be used.
@@ -98,9 +107,8 @@ def open_plant(path: Path, params_root: Path, scale: str, seed: int, params: Par
     description, own = load_description(path), load_own_plant(params_root)
     base = params or load(params_root, 1)
     clean = examine(read_records(path.parent / description.data, description), description, own.quality)
-    scale_params = base.learning.scales[scale]
-    found = episodes(clean, description, own.quality, getattr(torch, scale_params.number_type))
-    return OwnPlant(description, own, base, scale_params, seed, clean, found)
+    comes_near(clean, description, own.quality)
+    return OwnPlant(description, own, base, base.learning.scales[scale], seed, clean)
 
 
 def identify_plant(plant: OwnPlant) -> tuple[Identified, Validation]:

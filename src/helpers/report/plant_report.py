@@ -99,18 +99,23 @@ def export_policy(workshop: Workshop, policy: TrackingPolicy, folder: Path) -> f
     return worst
 
 
-def offline(plant: OwnPlant, workshop: Workshop) -> tuple[dict[str, pd.DataFrame], str]:
-    """What the record's controller was after, by Algorithm 2: the table of its weights, and a sentence."""
+def offline(plant: OwnPlant, workshop: Workshop) -> tuple[dict[str, pd.DataFrame], list[str]]:
+    """What the record's controller was after, by Algorithm 2: the table of its weights, and sentences."""
     model = workshop.nominal.to(plant.dtype)
     try:
+        shown = plant.demonstrations
         study, found = learn_offline(plant, model, task_on(plant, model))
-    except TrainingError as error:
-        return {}, f"the weights of the record's controller were not found: {error}"
+    except (InputError, TrainingError) as error:
+        return {}, [f"the weights of the record's controller were not found: {error}"]
+    told = [
+        f"{shown.trajectories.n_trajectories} episodes of {plant.description.horizon} samples show what the record's PID is after"
+    ]
+    told += [f"left out: {number} episodes ({reason})" for reason, number in shown.left_out.items() if number]
     if (gap := min(record.feature_gap for record in found.records)) > MEANINGLESS:
         why = "a feature of the record is next to zero, its variable is far from its set point"
-        return {}, f"Algorithm 2 has nothing to match: {why}"
+        return {}, [*told, f"Algorithm 2 has nothing to match: {why}"]
     weights = pd.DataFrame({"alpha*": found.weights.tolist()}, index=study.feature_names)
-    return {"Reward weights": weights}, f"Algorithm 2 matches the features of the record to {100 * gap:.1f} %"
+    return {"Reward weights": weights}, [*told, f"Algorithm 2 matches their features to {100 * gap:.1f} %"]
 
 
 def work(path: Path, folder: Path, params_root: Path, scale: str, seed: int) -> tuple[str, Outcome]:
@@ -122,7 +127,7 @@ def work(path: Path, folder: Path, params_root: Path, scale: str, seed: int) -> 
     params = load(params_root, 1)
     torch.set_num_threads(params.learning.scales[scale].threads)
     plant = open_plant(path, params_root, scale, seed, params)
-    name, found = plant.description.plant, plant.demonstrations
+    name = plant.description.plant
     given = load_plant(name, plant.description) if name else None
     identified, validation = identify_plant(plant)
     workshop = open_workshop(plant, identified)
@@ -132,9 +137,7 @@ def work(path: Path, folder: Path, params_root: Path, scale: str, seed: int) -> 
     verdict = pass_gate(workshop, controllers)
     sentences = [
         verdict.words,
-        f"{len(plant.clean.table)} samples, {len(plant.clean.findings)} findings, {found.trajectories.n_trajectories} episodes of "
-        f"{plant.description.horizon} samples",
-        *(f"left out: {number} episodes ({reason})" for reason, number in found.left_out.items() if number),
+        f"{len(plant.clean.table)} samples, {len(plant.clean.findings)} findings",
         f"the controller of the record: the PID {'of the description' if plant.description.pid else 'found in it'}; a PID that is "
         f"fitted to the record explains {100 * workshop.explained:.0f} % of the moves of the inputs",
         *(f"warning: {words}" for words in (*identified.warnings, *validation.warnings)),
@@ -157,7 +160,7 @@ def work(path: Path, folder: Path, params_root: Path, scale: str, seed: int) -> 
         "model": validation_figure(validation, plant.description),
         "quality": quality_figure(plant.clean, plant.description),
     }
-    return plant.description.title, Outcome(tables, figures, (*sentences, words))
+    return plant.description.title, Outcome(tables, figures, (*sentences, *words))
 
 
 def run(path: Path, output: Path, params_root: Path, scale: str, seed: int) -> Outcome:

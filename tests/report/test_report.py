@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from bs4 import BeautifulSoup
 
-from helpers.report import collection, report, scorecard, typesetting
+from helpers.report import collection, report, scorecard, search_report, typesetting
 from helpers.runs import freshness, identity
 from helpers.runs.artifacts import ArtifactError, load_stage, save_stage
 from helpers.runs.sources import PROJECT
@@ -89,8 +89,11 @@ def test_links_lead_somewhere_inside_the_report_to_its_tables_and_to_the_code(pa
 def test_figures_tables_and_equations_have_captions_and_numbers_and_are_linked_both_ways(page, text):
     """Whatever has a number is led to from the text, and its number leads back; only what page one shows needs no lead."""
     images = page("img")
-    benchmarks = (report.BENCHMARKS / "scaling.svg").is_file()  # of make bench, shown where it was run
-    assert len(images) == 2 + 3 + 5 * len(CASES) + benchmarks
+    # Of make bench and make search, shown where they were run.
+    benchmarks, searched = (
+        (folder / name).is_file() for folder, name in ((report.BENCHMARKS, "scaling.svg"), (search_report.FOUND, "trials.csv"))
+    )
+    assert len(images) == 2 + 3 + 5 * len(CASES) + benchmarks + 2 * searched
     assert all(len(image.get("alt", "").split()) > 5 and image.find_parent("figure") for image in images)
     assert len({image["alt"] for image in images}) == len(images)
     assert len(page("thead")) == len(page("table")) >= 8

@@ -45,8 +45,8 @@ def gap_figure(trials: pd.DataFrame, published: Mapping[int, PublishedCase]) -> 
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
         head(axes, "", case_study(case), f"case {case}")
-    figure.supxlabel("rank of the setting on the first seed")
-    figure.supylabel("feature gap (%)")
+    figure.supxlabel("rank of the setting on the first seed", fontsize=10)
+    figure.supylabel("feature gap (%)", fontsize=10)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)
     return figure
 

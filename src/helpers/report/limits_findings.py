@@ -76,18 +76,18 @@ def tuned(results: Results) -> dict[int, dict[str, float]]:
 def practice(results: Results) -> dict[str, Any]:
     """What helps to choose.
 
-    model_ahead: the cases in which minimum variance on y lies above every learner at the last budget; never_below: the controllers
+    with_model: by case, minimum variance on y in per cent of the best learner at the last budget; never_below: the controllers
     that no condition puts below the PID; least: the range of what those that end in REINFORCE keep of the PID's objective at other
     set points, in per cent; without_model: by budget the best that needs none, with its cases. All in the median.
     """
     listed = limits_report.listed_budgets(results).astype({"metric": int})
     medians = listed.groupby(["case", "metric", "learner"])["value"].median()
     reached = limits_report.read(results, "attainable", "gaps.csv").groupby(["case", "controller"])["objective"].median()
-    model_ahead: list[int] = []
+    with_model: dict[int, float] = {}
     without_model: dict[int, dict[str, list[int]]] = {}
     for (case, budget), row in medians.unstack("learner").iterrows():
-        if budget == max(listed["metric"]) and reached[case, "minimum_variance"] > row.reindex(LEARNERS).max():
-            model_ahead.append(int(case))
+        if budget == max(listed["metric"]):
+            with_model[int(case)] = 100 * reached[case, "minimum_variance"] / row.reindex(LEARNERS).max()
         if budget and (others := row.reindex(RIVALS).dropna()).size:
             without_model.setdefault(int(budget), {}).setdefault(LABELS[others.idxmax()], []).append(int(case))
     shares = limits_report.worst(results)
@@ -95,7 +95,7 @@ def practice(results: Results) -> dict[str, Any]:
     points = shares[(shares["group"] == "set_point") & shares["controller"].isin(END_IN_REINFORCE)]
     least = points.groupby(["case", "controller"])["value"].median()
     return {
-        "model_ahead": model_ahead,
+        "with_model": with_model,
         "never_below": [LABELS[name] for name in LABELS if name in kept.index and (kept.loc[name] >= 100).all()],
         "least": (least.min(), least.max()),
         "without_model": without_model,

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -215,8 +216,10 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
         if (BENCHMARKS / "scaling.svg").is_file():
             shutil.copy2(BENCHMARKS / "scaling.svg", partial / "figures/benchmarks.svg")
         values = said(results, tabulated, origin)
-        to_html(render("report.md.jinja", folder, appendix=None, **values), partial)
-        to_pdf(render("report.md.jinja", folder, appendix=[], **values), partial)
+        pages: dict[Any, list[Any] | None] = {to_html: None, to_pdf: []}
+        with ThreadPoolExecutor() as pool:  # both wait for other programs
+            texts = (render("report.md.jinja", folder, appendix=appendix, **values) for appendix in pages.values())
+            list(pool.map(lambda typeset, text: typeset(text, partial), pages, texts))
         (partial / "report.md").write_text(render("summary.md.jinja", folder, appendix=None, **values), encoding="utf-8")
         for path in sorted(partial.iterdir(), key=lambda path: path.name == PROVENANCE):  # last: it vouches for the others
             target = folder / path.name

@@ -51,6 +51,7 @@ SAFETY = {  # of the online epochs, with their units
     "regret_episodes": "Regret (episodes of the PID)",
     "regret_peak": "Greatest on the way ($J$)",
 }
+LIKE_OTHERS = ("irl_reinforce", "irl_alone", "clone_reinforce", "csil_reinforce", "recurrent_ppo")  # their heat maps are left out
 GROUPS = {"model": "model", "noise": "noise", "set_point": "set points", "time": "dead time and load"}
 
 
@@ -275,18 +276,19 @@ def draw(results: Results) -> dict[str, Figure]:
     if gaps.empty:
         return {}
     levels = {int(case): rows.groupby("controller")["objective"].median() for case, rows in gaps.groupby("case")}
-    shown = _with_interval(gaps, "gap", ("gap_low", "gap_high"))
-    shown = shown.rename(columns={"median": "gap", "ci_low": "gap_low", "ci_high": "gap_high"})
+    ends = _with_interval(gaps, "gap", ("gap_low", "gap_high"))
+    ends = ends.rename(columns={"median": "gap", "ci_low": "gap_low", "ci_high": "gap_high"})
     drawn = {
         "limits_budget": limits_figures.budget_by_case(read(results, "budget", "curves.csv"), levels),
-        "limits_gaps": limits_figures.gap_figure(shown),
+        "limits_gaps": limits_figures.gap_figure(ends),
         "limits_robustness": limits_figures.robustness_figure(worst(results), GROUPS),
     }
     robust, place = read(results, "robustness", "robustness.csv"), ["group", "row", "column", "controller"]
     for name in heat_map_names(results):
         group, _, case = name.removeprefix("limits_").rpartition("_case_")
         cells = robust[robust["case"] == int(case)].groupby(place, as_index=False, sort=False)["objective"].median()
-        drawn[name] = limits_figures.heat_maps(cells, group, list(cells["controller"].unique()))
+        shown = [controller for controller in cells["controller"].unique() if controller not in LIKE_OTHERS]
+        drawn[name] = limits_figures.heat_maps(cells, group, shown)
     return drawn
 
 

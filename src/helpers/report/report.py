@@ -75,7 +75,9 @@ def draw(results: Results, compared: pd.DataFrame) -> dict[str, Figure]:
         drawn[f"control_case_{case}"] = figures.control_figure(response, outputs, inputs, target, descriptions)
         if params is first:
             look: dict[str, Any] = {"zoom_from": None, "size": (verdict_figures.NARROW, 3.9), "agent_label": "improved policy"}
-            drawn["page_one"] = figures.control_figure(response, outputs, inputs, target, **look)
+            keys = ["controller", "kind", "variable", "time_index"]
+            middle = response.groupby(keys, sort=False, as_index=False)[["mean", "std"]].median()
+            drawn["page_one"] = figures.control_figure(middle, outputs, inputs, target, **look)
         response = results.table(case, offline, "response.csv")
         drawn[f"tracking_case_{case}"] = figures.tracking_figure(response, outputs, target, descriptions)
         history = results.table(case, offline, "history.csv")

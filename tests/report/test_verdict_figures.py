@@ -68,3 +68,16 @@ def test_a_claim_has_a_mark_for_each_case_that_it_speaks_of():
     assert len(axes.lines) == 4
     assert [marks[0, "I"], marks[2, "III"]] == [MARKS["holds"]["marker"], MARKS["cannot tell"]["marker"]]
     assert [label.get_text().split()[0] for label in axes.get_yticklabels()] == ["One", "Another"]
+
+
+def test_the_profile_of_a_setting_is_the_parabola_of_its_interval():
+    """The loss rises by ((value - 2) / 0.1)^2; allowed is a rise of 1, so that the interval ends at 1.9 and 2.1."""
+    value = np.array([1.5, 2.0, 2.3])
+    profiles = pd.DataFrame({"setting": "PID1.integral T", "value": value, "rise": (10 * (value - 2)) ** 2})
+    settings = {"setting": ["PID1.integral"], "component": ["T"], "low": [1.9], "high": [2.1], "in_parameter_files": [2.05]}
+    (axes, *empty) = verdict_figures.profiles_figure(profiles, pd.DataFrame(settings)).axes
+    assert axes.get_title(loc="left") == "PID1 integral gain, $T^*$"
+    assert not any(axes.axison for axes in empty)
+    curve = next(line for line in axes.lines if line.get_label() == "rise of the loss")
+    np.testing.assert_allclose(curve.get_ydata(), (10 * (curve.get_xdata() - 2)) ** 2, atol=1e-9)
+    assert curve.get_xdata()[[0, -1]] == pytest.approx([1.78, 2.22])

@@ -98,6 +98,9 @@ def draw(results: Results, compared: pd.DataFrame) -> dict[str, Figure]:
         weights = results.seeds[(results.seeds["stage"] == "offline") & results.seeds["metric"].str.startswith("alpha:")]
         weights = weights.pivot_table(index=["case", "seed"], columns="metric", values="value").reset_index()
         drawn |= search_report.draw(results.search, results.published, weights)
+    if results.inferred is not None:
+        found = (results.inferred.table(f"{name}.csv") for name in ("profiles", "settings"))
+        drawn["inferred_profiles"] = verdict_figures.profiles_figure(*found)
     drawn |= limits_report.draw(results)
     return {f"figure_{OF_THE_PAPER[name]}" if name in OF_THE_PAPER else name: figure for name, figure in drawn.items()}
 
@@ -213,8 +216,6 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
         tabulated["comparison"].to_csv(partial / "comparison.csv", index=False, float_format="%.10g")
         results.seeds.to_csv(partial / "seeds.csv", index=False, float_format="%.10g")
         (partial / PROVENANCE).write_text(json.dumps(origin, indent=1) + "\n", encoding="utf-8")
-        if results.inferred is not None:
-            shutil.copy2(results.inferred.path("profiles.svg"), partial / "figures/inferred_profiles.svg")
         if (BENCHMARKS / "scaling.svg").is_file():
             shutil.copy2(BENCHMARKS / "scaling.svg", partial / "figures/benchmarks.svg")
         values = said(results, tabulated, origin)

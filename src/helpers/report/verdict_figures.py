@@ -28,6 +28,7 @@ ROWS = {"expert": "PID, features", "policy": "policy, features", "alpha": "weigh
 LINEAR = 10.0  # per cent to either side of the published value that are drawn to scale; beyond, by powers of ten
 SMOOTH = 0.05  # of all epochs, over which a curve of weights is averaged
 NARROW = 7.6  # inches, of a picture on page one
+BOUNDS = {"input_bound": "bounds ±", "input_low": "lower bound", "input_high": "upper bound"}  # settings of notebook 00 in words
 
 
 def _handles(verdicts: Iterable[str], found: Iterable[str]) -> list[Line2D]:
@@ -152,3 +153,41 @@ def _beside_the_printed(axes: Axes, letter: str, printed: pd.DataFrame) -> None:
     star = Line2D([], [], marker="*", color=INK, linestyle="", markersize=9, label="printed")
     place: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.17), "ncols": 2, "frameon": False, "columnspacing": 1}
     axes.legend(handles=[star, *_handles(printed["verdict"].unique(), printed["verdict"])], **place)
+
+
+def profiles_figure(profiles: pd.DataFrame, settings: pd.DataFrame) -> Figure:
+    """How far the loss of notebook 00 rises when one setting is held and all others are fitted again: a panel for each setting.
+
+    Between two fits the root of the rise is taken as linear, which is exact for a parabola, as for the intervals of the table.
+
+    Args:
+        profiles: columns setting, value, rise. settings: columns setting, component, low, high, in_parameter_files.
+    """
+    across = 4
+    figure = empty_figure(WIDTH, 1.75 * -(-len(settings) // across) + 0.6)
+    panels = figure.subplots(-(-len(settings) // across), across, squeeze=False).ravel()
+    for axes, row in zip(panels, settings.itertuples(), strict=False):
+        held = profiles[profiles["setting"] == f"{row.setting} {row.component}"].sort_values("value")
+        value, root = held["value"].to_numpy(), np.sqrt(held["rise"].to_numpy())
+        reach = 0.6 * (row.high - row.low)
+        ends = max(value[0], row.low - reach), min(value[-1], row.high + reach)
+        drawn = np.linspace(*ends, 200)
+        axes.axvspan(row.low, row.high, color=INK, alpha=0.12, linewidth=0, label="the tables cannot tell")
+        axes.plot(drawn, np.interp(drawn, value, root) ** 2, color=INK, label="rise of the loss")
+        shown = (value >= ends[0]) & (value <= ends[1])
+        axes.plot(value[shown], root[shown] ** 2, "o", color=INK, markersize=3.5, label="fitted again")
+        filed: Any = {"color": MARKS["differs"]["color"], "linestyle": ":", "linewidth": 2}
+        axes.axvline(row.in_parameter_files, label="in the parameter files", **filed)
+        kind, _, of = row.setting.rpartition(".")
+        words = f"{kind} {of} gain".strip() if kind else BOUNDS.get(of, of.replace("_", " "))
+        loop = f", {symbol(row.component)}" if row.component != "-" else ""
+        axes.set_title(f"{words}{loop}", fontsize=9, loc="left")
+        axes.set_ylim(bottom=0)
+        axes.xaxis.set_major_locator(MaxNLocator(4))
+        axes.set_label(f"{row.setting} {row.component}")
+    for axes in panels[len(settings) :]:
+        axes.set_axis_off()
+    figure.supxlabel("value of the setting (in its own unit)", fontsize=10)
+    figure.supylabel("rise of the loss (no unit)", fontsize=10)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False)
+    return figure

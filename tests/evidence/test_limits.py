@@ -11,9 +11,11 @@ from helpers.evidence import equal_budget, exploration, limits, robustness
 from helpers.evidence.attainable import Tabulated
 from helpers.evidence.scheduled_pid import ScheduledPID
 from helpers.learning.evaluation import objective
+from helpers.learning.learner import TrainingError
 from helpers.plant.controllers import PID
 from helpers.report import limits_answer
 from helpers.report.limits_figures import LABELS, budget_curves, gap_figure, heat_maps, regret_figure
+from helpers.runs.study import Study
 from tests.plant.test_controllers import run
 
 
@@ -221,3 +223,13 @@ def test_figures_show_the_tables(contest):
     assert dip.lines[0].get_ydata() == pytest.approx([100.0, 400 / 3])
     assert left.lines[0].get_ydata().tolist() == [1.0, 4.0]
     assert right.lines[0].get_ydata().tolist() == [2.0, 0.0, -1.0]
+
+
+def test_where_a_plant_earns_nothing_the_policy_stays_as_it_is(contest, monkeypatch):
+    def fails(*_):
+        raise TrainingError("every episode earned the same reward")
+
+    monkeypatch.setattr(Study, "improve", fails)
+    there = robustness.improved_on_mismatch(contest).pivot_table(index=["state", "input"], columns="controller", values="objective")
+    assert len(there) == 2
+    assert there["online_there"].equals(there["offline"].rename("online_there"))

@@ -59,33 +59,35 @@ def test_the_numbers_are_those_of_the_reference_run():
     provenance = json.loads((REFERENCE / "provenance.json").read_text(encoding="utf-8"))
     minutes, n_seeds, hours = map(float, re.findall(r"\d+(?:\.\d+)?", block("cost")))
     assert n_seeds == len(provenance["seeds"])
-    assert (minutes, hours) == pytest.approx((time["seconds"].sum() / 60, provenance["stage_seconds"] / 3600), abs=0.51)
+    assert (minutes, hours) == pytest.approx((time["seconds"].sum() / 60, provenance["stage_seconds"] / 3600), abs=0.051)
     rows = {line.split("|")[1].strip(): line for line in block("time").splitlines() if line.startswith("|")}
     for stage, times in time.groupby("stage")["seconds"]:
         assert re.findall(r"\b\d+\b", rows[stage].replace(stage, "")) == [f"{seconds:.0f}" for seconds in times]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in block("limits").splitlines()[2:]]
     assert len(cells) == 11
     every = limits.set_index("controller")
-    assert [row for row in cells if row[1:] != every.loc[row[0]].filter(like="= 30").tolist()] == []
+    assert [row for row in cells if row[1:] != every.loc[row[0]].tolist()] == []
 
 
 @published
 def test_what_follows_from_the_limits_is_what_the_reference_run_shows():
-    """Minimum variance ahead of all learners; improving elsewhere ahead of it, mostly of MPC too; only MPC never below the PID."""
+    """One policy nearest to the best; online at minimum variance, and ahead where it learns anew; only MPC never below the PID."""
 
     def medians(name, index):
         table = pd.read_csv(REFERENCE / f"tables/limits_{name}.csv").set_index(index)
         return table.map(lambda cell: float(str(cell).split(" ")[0]))
 
-    gaps = medians("gaps", "controller").filter(like="= 30")
-    learners = gaps.loc[[name for name in gaps.index if "REINFORCE" in name or "PPO" in name or name == "PID, tuned"]]
-    assert len(learners) == 6
-    assert (learners > gaps.loc["minimum variance on y"]).all(axis=None)
+    gaps = medians("gaps", "controller")
+    others = gaps.drop(["one policy, through the model", "minimum variance on x", "programme, filtered y", "programme on x"])
+    assert (gaps.loc["one policy, through the model"] <= others).all(axis=None)
+    assert (gaps.loc["online policy"] - gaps.loc["minimum variance on y"]).max() < 1
     there = medians("improved", ["controller", "case"])
-    ahead = {name: there.loc["improved on that plant"] > there.loc[name] for name in ("minimum variance on y", "offset-free MPC")}
-    assert ahead["minimum variance on y"].all(axis=None)
-    assert ahead["offset-free MPC"].sum(axis=None) > 3  # of six
-    kept = medians("robustness", ["controller", "case"]).groupby("controller").min().min(axis=1).drop("PID (demonstrator)")
+    for name in ("minimum variance on y", "offset-free MPC"):
+        assert (there.loc["improved on that plant"] > there.loc[name]).all(axis=None)
+    shares = medians("robustness", ["controller", "case"])
+    elsewhere = shares.loc["online policy", "set points"]
+    assert f"{elsewhere.min():.0f} to {elsewhere.max():.0f} % of the PID's objective" in PAGES["README.md"]
+    kept = shares.groupby("controller").min().min(axis=1).drop("PID (demonstrator)")
     assert kept[kept >= 100].index.tolist() == ["offset-free MPC"]
 
 

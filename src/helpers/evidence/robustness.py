@@ -10,11 +10,12 @@ from helpers.evidence.equal_budget import Build, Contest, mean_and_error
 from helpers.evidence.experiments import scaled
 from helpers.evidence.mismatch import Delayed, LoadStep
 from helpers.learning.evaluation import objective
+from helpers.learning.policy import LSTMPolicy
 from helpers.plant.controllers import Controller
 from helpers.plant.process import Process
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
-from helpers.runs.study import Study
+from helpers.runs.study import Study, copied
 
 
 class Condition(NamedTuple):
@@ -87,3 +88,24 @@ def _under(contest: Contest, condition: Condition, controller: Controller) -> Tr
     if condition.dead_time:
         controller = Delayed(controller, task, condition.dead_time)
     return rollout(process, controller, task, contest.scale.grid, contest.session.stream("evaluation"))
+
+
+def improved_on_mismatch(contest: Contest) -> pd.DataFrame:
+    """Online improvement that starts on the mismatched plant: the objective there before and after, beside others.
+
+    Columns: state, input (factors), controller, objective. nominal: the policy that was improved on the plant of the model.
+    """
+    params, rows = contest.limits.robustness, []
+    for state, entry in zip(params.improve_state, params.improve_input, strict=True):
+        plant = mismatched(contest.session, state, entry)
+        controllers: dict[str, Controller | LSTMPolicy] = {
+            "expert": plant.expert,
+            "offline": contest.imitator,
+            "online": contest.improved,
+            "online_there": plant.improve(copied(contest.imitator), "x").policy,
+            "minimum_variance": contest.session.minimum_variance,
+        }
+        for name, controller in controllers.items():
+            batch = plant.fresh(controller, contest.scale.judged)
+            rows.append((state, entry, name, contest.returns(batch).mean().item()))
+    return pd.DataFrame(rows, columns=["state", "input", "controller", "objective"])

@@ -1,5 +1,7 @@
 """The plants that taught no controller: their channels, their records, and what is told of them."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -42,3 +44,22 @@ def test_the_summary_holds_medians_and_verdicts():
     assert [cell.strip() for cell in line.split("|")[2:-1]] == [gate.POLICY, "0.800", "1.000", "0.010", "1.000"]
     assert "2 of 3" in told
     assert "policy (3)" in told
+
+
+def test_what_was_judged_at_the_same_commit_is_not_judged_again(tmp_path, monkeypatch):
+    asked = []
+
+    def judged(name, seed):
+        asked.append((name, seed))
+        row = {"plant": name, "seed": seed, "released": True, "keep": gate.POLICY, "seconds": 1.0, "truth": "as recorded"}
+        return pd.DataFrame([row | {"controller": gate.POLICY, "mean |e|": 0.9, "movement": 1.0, "offset": 0.0}])
+
+    names = {"FOUND": tmp_path, "SO_FAR": tmp_path / "results/plants.csv", "judged": judged}
+    names |= {"ProcessPoolExecutor": ThreadPoolExecutor, "code_revision": lambda _: "abc"}
+    for name, value in names.items():
+        monkeypatch.setattr(plants, name, value)
+    for seeds, new in (("1", 8), ("1", 0), ("2", 8)):
+        asked.clear()
+        assert plants.main(["--seeds", seeds]) == 0
+        assert len(asked) == new
+    assert len(pd.read_csv(tmp_path / "plants.csv")) == 16

@@ -219,10 +219,13 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
         if (BENCHMARKS / "scaling.svg").is_file():
             shutil.copy2(BENCHMARKS / "scaling.svg", partial / "figures/benchmarks.svg")
         values = said(results, tabulated, origin)
-        pages: dict[Any, list[Any] | None] = {to_html: None, to_pdf: []}
         with ThreadPoolExecutor() as pool:  # both wait for other programs
-            texts = (render("report.md.jinja", folder, appendix=appendix, **values) for appendix in pages.values())
-            list(pool.map(lambda typeset, text: typeset(text, partial), pages, texts))
+            begun = [
+                pool.submit(typeset, render("report.md.jinja", folder, appendix=appendix, **values), partial)
+                for typeset, appendix in ((to_html, None), (to_pdf, []))
+            ]
+        for page in begun:
+            page.result()
         (partial / "report.md").write_text(render("summary.md.jinja", folder, appendix=None, **values), encoding="utf-8")
         for path in sorted(partial.iterdir(), key=lambda path: path.name == PROVENANCE):  # last: it vouches for the others
             target = folder / path.name

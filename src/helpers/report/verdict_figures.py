@@ -164,8 +164,9 @@ def profiles_figure(profiles: pd.DataFrame, settings: pd.DataFrame) -> Figure:
         profiles: columns setting, value, rise. settings: columns setting, component, low, high, in_parameter_files.
     """
     across = 4
-    figure = empty_figure(WIDTH, 1.75 * -(-len(settings) // across) + 0.6)
-    panels = figure.subplots(-(-len(settings) // across), across, squeeze=False).ravel()
+    down = -(-len(settings) // across)
+    figure = empty_figure(WIDTH, 1.75 * down + 0.6)
+    panels = figure.subplots(down, across, squeeze=False).ravel()
     for axes, row in zip(panels, settings.itertuples(), strict=False):
         held = profiles[profiles["setting"] == f"{row.setting} {row.component}"].sort_values("value")
         value, root = held["value"].to_numpy(), np.sqrt(held["rise"].to_numpy())

@@ -230,6 +230,6 @@ def test_where_a_plant_earns_nothing_the_policy_stays_as_it_is(contest, monkeypa
         raise TrainingError("every episode earned the same reward")
 
     monkeypatch.setattr(Study, "improve", fails)
-    there = limits.improved_on_mismatch(contest).pivot_table(index=["state", "input"], columns="controller", values="objective")
+    there = robustness.improved_on_mismatch(contest).pivot_table(index=["state", "input"], columns="controller", values="objective")
     assert len(there) == 2
     assert there["online_there"].equals(there["offline"].rename("online_there"))

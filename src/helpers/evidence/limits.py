@@ -1,7 +1,6 @@
 """The first verbs of notebook 06: how far every controller is from the attainable, and its control quality."""
 
 from collections.abc import Mapping
-from contextlib import suppress
 from functools import partial
 
 import numpy as np
@@ -13,16 +12,13 @@ from helpers.evidence.attainable import Optimum, Resolution, Tabulated, dynamic_
 from helpers.evidence.equal_budget import Build, Contest, Learned, as_it_is, mean_and_error
 from helpers.evidence.experiments import prepare
 from helpers.evidence.kalman import Filtered
-from helpers.evidence.robustness import mismatched
 from helpers.learning.control_quality import harris_index, quality
 from helpers.learning.evaluation import objective
-from helpers.learning.learner import TrainingError
-from helpers.learning.policy import LSTMPolicy
 from helpers.plant.controllers import Controller
 from helpers.plant.rollout import rollout
 from helpers.plant.task import Trajectories
 from helpers.runs.session import Session
-from helpers.runs.study import Study, copied
+from helpers.runs.study import Study
 from helpers.settings.limits import load_limits
 
 NORMAL = 1.96  # half the width of a 95 % interval, in standard errors
@@ -160,27 +156,3 @@ def control_quality(contest: Contest, builds: Mapping[str, Build], stationary: M
         }
         rows += [(name, figure, value) for figure, value in figures.items()]
     return pd.DataFrame(rows, columns=["controller", "figure", "value"])
-
-
-def improved_on_mismatch(contest: Contest) -> pd.DataFrame:
-    """Online improvement that starts on the mismatched plant: the objective there before and after, beside others.
-
-    Columns: state, input (factors), controller, objective. online: the policy that was improved on the plant of the model;
-    online_there: on this one.
-    """
-    params, rows = contest.limits.robustness, []
-    for state, entry in zip(params.improve_state, params.improve_input, strict=True):
-        plant, there = mismatched(contest.session, state, entry), contest.imitator
-        with suppress(TrainingError):  # nothing to learn from, as where no input holds the set point: the policy stays as it is
-            there = plant.improve(copied(contest.imitator), "x").policy
-        controllers: dict[str, Controller | LSTMPolicy] = {
-            "expert": plant.expert,
-            "offline": contest.imitator,
-            "online": contest.improved,
-            "online_there": there,
-            "minimum_variance": contest.session.minimum_variance,
-        }
-        for name, controller in controllers.items():
-            batch = plant.fresh(controller, contest.scale.judged)
-            rows.append((state, entry, name, contest.returns(batch).mean().item()))
-    return pd.DataFrame(rows, columns=["state", "input", "controller", "objective"])

@@ -70,7 +70,7 @@ def episodes(clean: CleanRecords, description: PlantDescription, params: Quality
     Raises:
         InputError: if there are too few, or the record does not come near the set point of the task.
     """
-    table, n_steps, moved = clean.table, description.horizon, comes_near(clean, description, params)
+    table, n_steps, moved = clean.table, description.horizon, set_point_moves(clean, description, params)
     at_task, came_from = _set_points(clean, description, params)
     described = any(variable.set_point != variable.steady_state for variable in description.controlled if variable.set_point_tag)
     moving = described and moved
@@ -109,20 +109,20 @@ def episodes(clean: CleanRecords, description: PlantDescription, params: Quality
     return Episodes(Trajectories(outputs, outputs, inputs, inputs), before, rows, left_out)
 
 
-def comes_near(clean: CleanRecords, description: PlantDescription, params: QualityParams) -> bool:
+def set_point_moves(clean: CleanRecords, description: PlantDescription, params: QualityParams) -> bool:
     """Whether a set point moves in the record.
 
     Raises:
         InputError: if none of a loop's set points is that of the task, or no measurement comes half the way there.
     """
     moves = [
-        _comes_near(clean, variable, params.set_point_band * abs(variable.scale), description.data)
+        _set_point_moves(clean, variable, params.set_point_band * abs(variable.scale), description.data)
         for variable in description.controlled
     ]
     return any(moves)
 
 
-def _comes_near(clean: CleanRecords, variable: ControlledVariable, band: float, data: str) -> bool:
+def _set_point_moves(clean: CleanRecords, variable: ControlledVariable, band: float, data: str) -> bool:
     usable = clean.table["segment"] >= 0
     aim, key = f"that of the task, {variable.set_point:g} {variable.unit}", f"'set_point' of '{variable.name}'"
     moves = False

@@ -16,7 +16,7 @@ from helpers.learning.model_gradient import Descent, GradientRecord, model_gradi
 from helpers.learning.tracking_policy import Gains, TrackingPID, TrackingPolicy
 from helpers.own_plant import gate
 from helpers.own_plant.description import PlantDescription, load_description
-from helpers.own_plant.episodes import Episodes, comes_near, episodes, stretches
+from helpers.own_plant.episodes import Episodes, episodes, set_point_moves, stretches
 from helpers.own_plant.identify import Identified, Validation, hold_out, identify, thin_out, validate_model
 from helpers.own_plant.model import ArmaxModel
 from helpers.own_plant.operation import Operation, described_gains, draw_scenarios, operation, recorded_gains
@@ -107,7 +107,7 @@ def open_plant(path: Path, params_root: Path, scale: str, seed: int, params: Par
     description, own = load_description(path), load_own_plant(params_root)
     base = params or load(params_root, 1)
     clean = examine(read_records(path.parent / description.data, description), description, own.quality)
-    comes_near(clean, description, own.quality)
+    set_point_moves(clean, description, own.quality)
     return OwnPlant(description, own, base, base.learning.scales[scale], seed, clean)
 
 

@@ -65,6 +65,11 @@ def test_a_warning_in_an_executed_copy_names_no_folder_of_the_machine(tmp_path):
     assert said == "package/file.py:1: UserWarning: src/helpers/runs/run.py\n"
 
 
+def test_a_stage_starts_without_the_grammar_of_addresses_that_no_notebook_needs():
+    command = "import sys, helpers.runs.run; print(sys.modules['rfc3987_syntax'])"  # a second of every stage
+    assert subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, check=True).stdout == "None\n"
+
+
 def test_a_notebook_runs_from_any_directory_and_leaves_no_trace_of_the_machine(here, capfd):
     arguments = ["01_demonstrations", "copies/01.ipynb", "-p", "case", "2", "-p", "seed", "5", "-p", "scale", "smoke"]
     arguments += ["-p", "output_root", str(here / "out")]

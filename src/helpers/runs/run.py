@@ -1,5 +1,8 @@
 """One stage = one notebook, executed by papermill. `python -m helpers run --help` tells how."""
 
+import helpers.runs.quick_start  # noqa: F401  (before nbformat)
+
+# isort: split
 import argparse
 import base64
 import os
@@ -21,7 +24,6 @@ from nbclient.exceptions import DeadKernelError
 from papermill.exceptions import PapermillExecutionError
 from traitlets.config import Config
 
-import helpers.runs.quick_start  # noqa: F401  (before nbformat)
 from helpers.runs.pictures import smaller
 from helpers.runs.request import SessionError, check_parameters, check_place
 from helpers.runs.scratch import beside, sweep

@@ -11,7 +11,8 @@ export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 PYTEST = $(BIN)/python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder --nbval
-SNAKEMAKE = $(BIN)/python -m snakemake --profile profiles/local --cores $(CORES)
+SNAKEMAKE = $(BIN)/python -m snakemake --profile profiles/local --cores
+EVIDENCE = evidence=1 seeds=$(SEEDS) scale=$(SCALE) missing=$(MISSING) $(if $(filter smoke,$(SCALE)),reports=results/smoke/report)
 
 # Tests of numbers: what another processor may round otherwise.
 NUMERICAL := tests/plant tests/learning tests/evidence tests/own_plant tests/runs/test_study.py
@@ -39,18 +40,19 @@ $(VENV)/alternatives: $(VENV)/installed
 	touch $@
 
 reports: setup  ## run everything at paper scale and write reports/latest/report.html
-	$(SNAKEMAKE) --config seeds=$(SEEDS) scale=paper missing=$(MISSING)
+	$(SNAKEMAKE) $(CORES) --config seeds=$(SEEDS) scale=paper missing=$(MISSING)
 	@echo "The report: $(CURDIR)/reports/latest/report.html"
 
 evidence: setup $(VENV)/alternatives  ## twenty seeds of it, the claims, the limits, the trials and the inferred settings; resumable
-	$(SNAKEMAKE) --config seeds=$(SEEDS) scale=$(SCALE) missing=$(MISSING) evidence=1 $(if $(filter smoke,$(SCALE)),reports=results/smoke/report)
+	seq 0 $$(($(SEEDS) - 1)) | xargs -n 1 -P $(CORES) sh -c '$(SNAKEMAKE) 1 --config $(EVIDENCE) only=$$0 -- one_seed || true'
+	$(SNAKEMAKE) $(CORES) --config $(EVIDENCE)
 
 search: setup  ## the best settings of the printed algorithms, and a sample of weights; hours, resumable; writes reports/reference/search
 	printf '1\n2\n' | xargs -n 1 -P $(CORES) $(BIN)/python -m helpers search --scale $(SCALE)
 	$(BIN)/python -m helpers search --scale $(SCALE)
 
 smoke: setup  ## the same in seconds, with few epochs; the report goes to results/smoke/report/
-	$(SNAKEMAKE) --config seeds=1 scale=smoke reports=results/smoke/report
+	$(SNAKEMAKE) $(CORES) --config seeds=1 scale=smoke reports=results/smoke/report
 	@echo "The report of the smoke run: $(CURDIR)/results/smoke/report/report.html"
 
 test: setup  ## style, types, layers, tests and the notebooks against their stored outputs

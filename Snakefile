@@ -1,7 +1,7 @@
 # The order of the stages for each case and seed. Every stage is one notebook, executed by helpers.runs.run.
 # Settings (snakemake --config name=value): seeds (how many), scale (smoke or paper), results, reports (folders),
-# evidence=1 for the runs beyond the paper's own (notebooks 00 and 06 to 09, and trials of offline learning), and
-# missing=1 for a report of the seeds whose stages are all there.
+# evidence=1 for the runs beyond the paper's own (notebooks 00 and 06 to 09, and trials of offline learning),
+# missing=1 for a report of the seeds whose stages are all there, and only, the seed of the rule one_seed.
 import shlex
 import sys
 from pathlib import Path
@@ -46,6 +46,7 @@ wildcard_constraints:
 
 localrules:
     all,
+    one_seed,
 
 
 rule all:

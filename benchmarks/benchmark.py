@@ -127,7 +127,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         stages.to_csv(given.out / "stages.csv", index=False, float_format=FLOATS)
     figure = outcome.scaling_figure(scaled, fits, size.K, size.T)
     figure.savefig(given.out / "scaling.svg", metadata={"Date": None})
-    figure.savefig(given.out / "scaling.png")
     plt.close(figure)
     text = outcome.summary(compared, scaled, fits, stages, flops, load["at the start"])
     (given.out / "summary.md").write_text(text, encoding="utf-8")

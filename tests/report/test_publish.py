@@ -8,13 +8,17 @@ from pathlib import Path
 import pytest
 
 from helpers.report import publish
-from helpers.report.publish import PublishError, check, relinked
+from helpers.report.publish import PublishError, check, executed_copy
 from helpers.runs.sources import PROJECT
 
 REVISION = "0123abcd" * 5
 GOOD = {"scale": "paper", "revision": REVISION, "revisions_of_stages": [REVISION], "seeds": [0, 1], "missing_seeds": []}
 GOOD |= {"stage_seconds": 7200}
 OTHER = "f" * 40
+
+
+def executed(what):
+    return json.dumps({"cells": [], "metadata": {"what": what}})
 
 
 CHANGED = REVISION + "+changes"
@@ -66,14 +70,14 @@ def project(monkeypatch, tmp_path):
         latest / "comparison.csv": "a,b",
         latest / "seeds.csv": "case,seed,stage,metric,value\n1,0,offline,feature_gap,0.2\n",
         latest / "provenance.json": json.dumps(GOOD),
-        latest / "notebooks/05_report.ipynb": "05",
-        results / "paper/seed_0/case_1/notebooks/02_offline_irl_improved.ipynb": "02",
-        results / "paper/seed_0/case_1/notebooks/02_offline_irl_printed.ipynb": "02 printed",
-        results / "paper/seed_0/case_1/notebooks/02_offline_irl_whole_return.ipynb": "02 of a trial",
-        results / "paper/seed_0/case_3/notebooks/01_demonstrations.ipynb": "01",
-        results / "paper/seed_0/case_3/notebooks/.01_demonstrations.123.ipynb": "what a killed run left",
-        results / "paper/seed_0/notebooks/07_your_own_process.ipynb": "07",
-        results / "paper/seed_1/case_3/notebooks/01_demonstrations.ipynb": "01 of another seed",
+        latest / "notebooks/05_report.ipynb": executed("05"),
+        results / "paper/seed_0/case_1/notebooks/02_offline_irl_improved.ipynb": executed("02"),
+        results / "paper/seed_0/case_1/notebooks/02_offline_irl_printed.ipynb": executed("02 printed"),
+        results / "paper/seed_0/case_1/notebooks/02_offline_irl_whole_return.ipynb": executed("02 of a trial"),
+        results / "paper/seed_0/case_3/notebooks/01_demonstrations.ipynb": executed("01"),
+        results / "paper/seed_0/case_3/notebooks/.01_demonstrations.123.ipynb": executed("what a killed run left"),
+        results / "paper/seed_0/notebooks/07_your_own_process.ipynb": executed("07"),
+        results / "paper/seed_1/case_3/notebooks/01_demonstrations.ipynb": executed("01 of another seed"),
         tmp_path / "README.md": README,
         tmp_path / "docs/running.md": RUNNING,
     }
@@ -101,7 +105,7 @@ def test_publishing_copies_the_report_and_the_first_seed_s_notebooks_and_writes_
         *("notebooks/02_offline_irl_case_1.ipynb", "notebooks/02_offline_irl_printed_case_1.ipynb"),
         *("notebooks/01_demonstrations_case_3.ipynb", "notebooks/07_your_own_process.ipynb", "reliability.md"),
     }
-    assert (reference / "notebooks/01_demonstrations_case_3.ipynb").read_text() == "01"
+    assert json.loads((reference / "notebooks/01_demonstrations_case_3.ipynb").read_text())["metadata"] == {"what": "01"}
     assert sorted(path.name for path in (project / "reports").iterdir()) == ["latest", "reference"]
 
     lines = (project / "README.md").read_text(encoding="utf-8").splitlines()
@@ -226,10 +230,17 @@ def test_git_sees_nothing_of_what_a_kill_leaves_beside_the_reference():
     assert ignored.stdout.split() == left
 
 
-def test_links_of_an_executed_copy_lead_where_they_led_from_the_notebook():
-    for link, copy in (
+@pytest.mark.parametrize(
+    ("link", "leads"),
+    [
         ("[code](../src/helpers/x.py)", "[code](../../../src/helpers/x.py)"),
         ("[next](03_online_improvement.ipynb)", "[next](../../../notebooks/03_online_improvement.ipynb)"),
         ("[paper](https://doi.org/10.1002/x)", "[paper](https://doi.org/10.1002/x)"),
-    ):
-        assert relinked(f'"See {link}, and {link}."') == f'"See {copy}, and {copy}."'
+    ],
+)
+def test_an_executed_copy_leads_where_the_notebook_led_and_holds_a_table_once(link, leads):
+    data = {"text/html": "<table>", "text/plain": "a table"}
+    cells = [{"source": f"See {link}, and {link}."}, {"source": "", "outputs": [{"data": data}, {"data": {"text/plain": "7"}}]}]
+    told, shown = json.loads(executed_copy(json.dumps({"cells": cells})))["cells"]
+    assert told["source"] == f"See {leads}, and {leads}."
+    assert [output["data"] for output in shown["outputs"]] == [{"text/html": "<table>"}, {"text/plain": "7"}]

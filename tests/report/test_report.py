@@ -177,8 +177,11 @@ def test_every_figure_and_table_of_the_paper_has_its_files_in_place_of_older_one
 
 def test_a_drawing_is_shortened_by_what_no_screen_shows():
     text = '<text style="font-size: 9px; font-family: A, B; fill: #333" x="1.23456" transform="rotate(-0 1.2 3.4)">0.12345</text>'
-    short = '<text style="font-size: 9px; fill: #333" x="1.23">0.12345</text>'
-    assert typesetting.shortened(f'<svg width="9.123">\n  {text}</svg>') == f'<svg font-family="A, B" width="9.123">\n{short}</svg>'
+    line = '<g id="line"><path id="m1" d="M 1.234 2 \nL 3 -4.567 \nz\n"/><use xlink:href="#m1"/></g>'
+    drawing = f'<svg width="9.123">\n<metadata>\n who\n</metadata>\n<!-- what -->\n  {text}\n{line}</svg>'
+    short = '<text style="font-size:9px;fill:#333" x="1.23">0.12345</text>'
+    path = '<g><path id="m1" d="M1.23 2L3 -4.56z"/><use xlink:href="#m1"/></g>'
+    assert typesetting.shortened(drawing) == f'<svg font-family="A, B" width="9.123">\n{short}\n{path}</svg>'
 
 
 def test_comparison_has_one_row_for_each_published_number(written):

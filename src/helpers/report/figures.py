@@ -182,7 +182,7 @@ def learning_curves(
             axes.yaxis.set_major_formatter(FuncFormatter(_percent))
             axes.yaxis.set_minor_formatter(FuncFormatter(_percent_of_few))
         listed: list[Line2D] = [*axes.lines] if of_weights else []
-        if n_seeds > 1 and panel == "mean return":
+        if panel == "mean return":
             listed += _seed_handles(n_seeds)
         listed += _draw_levels(axes, epochs, levels)
         for (epoch, name), style in zip((marks or {}).items(), cycle(KIND_STYLES[2:]), strict=False):
@@ -355,7 +355,9 @@ def _draw_singles(axes: Axes, frame: pd.DataFrame, x: str, y: str, colour: str, 
 
 
 def _seed_handles(n_seeds: int) -> list[Line2D]:
-    """What thin and thick lines mean, for a legend."""
+    """What thin and thick lines mean, for a legend; with one seed there are none."""
+    if n_seeds < 2:
+        return []
     thin = Line2D([], [], color=INK, linewidth=THIN, label=f"thin: each of {n_seeds} seeds")
     return [thin, Line2D([], [], color=INK, label="thick: their median")]
 

@@ -136,9 +136,16 @@ def executed_copies(first: Path) -> dict[str, Path]:
     return copies | {path.name: path for path in of_no_case}
 
 
-def relinked(text: str) -> str:
-    """A notebook whose links lead from the folder of the executed copies to where they led from notebooks/."""
-    return LINK.sub(lambda found: "](../../../" if found[1] else "](../../../notebooks/", text)
+def executed_copy(text: str) -> str:
+    """A notebook whose links lead from the folder of the executed copies to where they led from notebooks/.
+
+    Of a table that is there as a page its plain twin is left out.
+    """
+    notebook = json.loads(LINK.sub(lambda found: "](../../../" if found[1] else "](../../../notebooks/", text))
+    for output in (output for cell in notebook["cells"] for output in cell.get("outputs", [])):
+        if "text/html" in output.get("data", {}):
+            output["data"].pop("text/plain", None)
+    return json.dumps(notebook, indent=1, ensure_ascii=False) + "\n"
 
 
 def publish() -> None:
@@ -169,9 +176,9 @@ def publish() -> None:
     for name, path in copies.items():
         target = partial / "notebooks" / name
         _copy(path, target)
-        target.write_text(relinked(target.read_text(encoding="utf-8")), encoding="utf-8")
+        target.write_text(executed_copy(target.read_text(encoding="utf-8")), encoding="utf-8")
     if (first / "inferred_settings").is_dir():
-        _copy(first / "inferred_settings", partial / "inferred_settings")
+        shutil.copytree(first / "inferred_settings", partial / "inferred_settings", ignore=shutil.ignore_patterns("*.png"))
     for part in APART:
         if (REFERENCE / part).exists() and not (partial / part).exists():
             _copy(REFERENCE / part, partial / part)

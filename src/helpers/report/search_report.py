@@ -1,6 +1,7 @@
 """What `make search` found: the printed algorithms' best settings, and which reward weights lead near the expert."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -38,7 +39,7 @@ def gap_figure(trials: pd.DataFrame, published: Mapping[int, PublishedCase]) -> 
         first = rows["seed"] == 0
         place = rows["setting"].map(rows[first].set_index("setting")["percent"].rank(method="first"))
         for which, colour, label in ((~first, LOOP_COLOURS[1], "other seeds"), (first, INK, "first seed")):
-            axes.plot(place[which], rows["percent"][which], ".", color=colour, markersize=3, label=label)
+            axes.plot(place[which], rows["percent"][which], ".", color=colour, markersize=3, label=label, rasterized=True)
         axes.axhline(100 * published[case].feature_gap, color=LEVEL, label="the paper's own gap")
         axes.axhline(100 * best.loc[case, "by_hand"], color=MUTED, linestyle="--", label="settings by hand, median over seeds")
         axes.axhline(100 * best.loc[case, "median"], color=LOOP_COLOURS[3], linestyle=":", label="best settings, median over seeds")
@@ -67,7 +68,8 @@ def weights_figure(weights: pd.DataFrame, learnt: Mapping[str, pd.DataFrame], pu
         shown |= {label: table[table["case"] == case] for label, table in learnt.items()}
         for place, (label, table) in enumerate(shown.items()):
             x = np.tile(np.arange(len(columns)) + 0.2 * (place - 1), (len(table), 1))
-            axes.plot(x.ravel(), table[columns].to_numpy().ravel(), ".", color=LOOP_COLOURS[place], alpha=0.6, label=label)
+            style: Any = {"color": LOOP_COLOURS[place], "alpha": 0.6, "label": label, "rasterized": True}
+            axes.plot(x.ravel(), table[columns].to_numpy().ravel(), ".", **style)
         axes.plot(range(len(columns)), printed[columns].iloc[0], "D", color=INK, markersize=5, label="printed")
         axes.axhline(0, color=MUTED, linewidth=1)
         axes.set_xticks(range(len(columns)), [feature_symbol(name.removeprefix("alpha:")) for name in columns])

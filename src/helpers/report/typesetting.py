@@ -92,24 +92,33 @@ def to_html(text: str, folder: Path) -> None:
 
 
 def to_pdf(text: str, folder: Path) -> None:
-    """report.pdf, by way of Typst with the fonts of matplotlib, in which the figures are written."""
+    """report.pdf, by way of Typst with the fonts of matplotlib, in which the figures are written.
+
+    Without the tags that read a PDF aloud, which are more than half of it: report.html can be read aloud.
+    """
     text = re.sub(r"\[([^][]*)\]\(#to-[^)]*\)", r"\1", text)  # a link has no place there that could be led back to
     source = pypandoc.convert_text(text, "typst", format="markdown", extra_args=[*OPTIONS, f"--template={TEMPLATE / 'report.typ'}"])
     (folder / "report.typ").write_text(source, encoding="utf-8")
     fonts = Path(matplotlib.get_data_path()) / "fonts/ttf"
-    typst.compile(folder / "report.typ", output=folder / "report.pdf", font_paths=[fonts], ignore_system_fonts=True)
+    typst.compile(folder / "report.typ", output=folder / "report.pdf", font_paths=[fonts], ignore_system_fonts=True, pdf_tags=False)
     (folder / "report.typ").unlink()
 
 
 def shortened(drawing: str) -> str:
-    """An SVG drawing in half the bytes, without what no screen shows.
+    """An SVG drawing in less than half the bytes, without what no screen shows.
 
-    Coordinates have two decimals, the font is named once, nothing is indented or turned by nought, and pictures of lines have a
-    palette.
+    Coordinates have two decimals, the font is named once, nothing is indented, named without being referred to or turned by nought,
+    and pictures of lines have a palette.
     """
     drawing = re.sub(r' (?:[dxy]="|transform="[rt])[^"]*"', lambda found: re.sub(r"(\.\d\d)\d+", r"\1", found[0]), drawing)
-    drawing = re.sub(r' transform="rotate\(-?0 [^"]*"|(?<=\n) +', "", drawing)
-    if fonts := re.search(r" font-family: ([^;\"]*);", drawing):
+    drawing = re.sub(
+        r' transform="rotate\(-?0 [^"]*"|(?<=\n) +|<metadata>.*?</metadata>\n|<!--.*?-->\n', "", drawing, flags=re.DOTALL
+    )
+    drawing = re.sub(r'(?<= d=")[^"]*', lambda found: re.sub(r"\s*([A-Za-z])\s*", r"\1", found[0]), drawing)
+    drawing = re.sub(r'(?<= style=")[^"]*', lambda found: re.sub(r"([:;]) ", r"\1", found[0]), drawing)
+    referred = set(re.findall(r"#([\w.]+)", drawing))
+    drawing = re.sub(r' id="([^"]*)"', lambda found: found[0] if found[1] in referred else "", drawing)
+    if fonts := re.search(r"font-family:([^;\"]*);", drawing):
         drawing = drawing.replace(fonts[0], "").replace("<svg ", f'<svg font-family="{fonts[1]}" ', 1)
     return re.sub(r'(?<=;base64,)[^"]+', lambda found: b64encode(_with_palette(b64decode(found[0]))).decode(), drawing)
 

@@ -364,23 +364,36 @@ def test_a_record_without_its_origin_is_refused(inputs):
         ("offline_improved", ("inputs", "torch"), "torch"),
         ("offline_improved", ("upstream", "case_2/demonstrations"), "seed_0/case_2/demonstrations"),
         ("offline_improved", ("seed",), "the record itself"),
-        ("limits_budget", ("inputs", "params/learning.yaml"), "params/learning.yaml"),
     ],
 )
 def test_a_mixture_is_refused_naming_the_result_and_what_changed(own, stage, entry, says):
-    folder = own / "smoke/seed_0/case_2"
-    for part in collection.LIMITS:
-        shutil.copytree(folder / "online_improved", folder / f"limits_{part}")
-    path = folder / stage / "record.json"
+    path = own / "smoke/seed_0/case_2" / stage / "record.json"
+    changed(path, entry)
+    sentence = refusal(own)
+    assert f"{path} (changed: {says})" in sentence
+    assert sentence.count("record.json") == 1
+
+
+def changed(path, entry):
+    """Write another value for an entry of a record."""
     whole = json.loads(path.read_text())
     part = whole[entry[0]] if len(entry) > 1 else whole
     assert entry[-1] in part
     part[entry[-1]] = 7
-    assert collect(own).n_seeds == 1
     path.write_text(json.dumps(whole))
-    sentence = refusal(own)
-    assert f"{path} (changed: {says})" in sentence
-    assert sentence.count("record.json") == 1
+
+
+def test_results_that_nobody_asked_for_are_left_out_when_made_from_other_inputs_and_the_report_says_so(own):
+    folder = own / "smoke/seed_0/case_2"
+    for part in collection.LIMITS:
+        shutil.copytree(folder / "online_improved", folder / f"limits_{part}")
+    assert (collect(own).left_out, len(collect(own).limits)) == ((), len(collection.LIMITS))
+    changed(folder / "limits_budget/record.json", ("inputs", "params/learning.yaml"))
+    results = collect(own)
+    assert results.left_out == ("03_online_improvement",)  # the notebook that the stand-in is of
+    assert results.limits == {}
+    assert [stage.record["notebook"] for stage in results.beyond] == ["09_one_policy"]  # which is committed too
+    assert "made from other code or parameters than there are now: 03_online_improvement" in rendered(results)
 
 
 def test_a_part_of_the_limits_alone_is_none_and_all_count_in_the_time(own):

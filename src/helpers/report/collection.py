@@ -12,7 +12,7 @@ import pandas as pd
 from helpers.learning.features import feature_names
 from helpers.report import claims, scorecard, search_report
 from helpers.runs.artifacts import RECORD, Stage, load_stage
-from helpers.runs.freshness import check
+from helpers.runs.freshness import refuse, stale
 from helpers.runs.identity import inputs
 from helpers.settings.paper import HEADLINE, Params, PublishedCase, load, load_published
 
@@ -46,6 +46,7 @@ class Results:
         one_policy, own_plant: summary.csv of notebook 09 and scores.csv of notebook 07 with a column seed; empty where not run.
         search: what `make search` wrote, if it was run.
         beyond: every stage beyond the paper's own runs, those of claims, budget, trials, limits and inferred settings.
+        left_out: of these runs the notebooks of which a result is there, but made from other inputs than there are now.
     """
 
     scale: str
@@ -65,6 +66,7 @@ class Results:
     beyond: tuple[Stage, ...] = ()
     made_from: Mapping[str, str] = field(default_factory=dict)
     missing: tuple[int, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     @cached_property
     def feature_names(self) -> list[str]:
@@ -114,14 +116,14 @@ def stacked(stages: Mapping[tuple[int, int], Stage], name: str, columns: tuple[s
 def collect(
     root: Path, params_root: Path, scale: str, cases: tuple[int, ...], n_seeds: int, missing_allowed: bool = False
 ) -> Results:
-    """Read every stage of every case and seed below `root`; claims, budget, trials and limits where they were run.
+    """Read every stage of every case and seed below `root`; claims, budget, trials and limits where they were run and still hold.
 
     Args:
         missing_allowed: leave out a seed of which a stage is missing, as long as another seed is whole.
 
     Raises:
-        ArtifactError: if a stage is missing or damaged, or was made from other parameters, code, package versions or earlier
-            results than there are now.
+        ArtifactError: if a stage is missing or damaged, or one of the paper's own runs was made from other parameters, code,
+            package versions or earlier results than there are now.
     """
     params = {case: load(params_root, case) for case in cases}
     published = {case: entry for case, entry in load_published(params_root).items() if case in cases}
@@ -149,23 +151,32 @@ def collect(
         paths = {(case, seed): root / scale / f"seed_{seed}" / f"case_{case}" / folder for case, seed in places}
         return {place: load_stage(path, made_by) for place, path in paths.items() if (path / RECORD).is_file()}
 
-    experiments, budget = optional(EXPERIMENTS, "notebook 08"), optional(BUDGET, "the online budget")
-    one_policy, own_plant = optional(ONE_POLICY, "notebook 09", (1,)), optional(OWN_PLANT, "notebook 07", (1,))
+    runs: dict[Any, dict[Any, Stage]] = {
+        EXPERIMENTS: optional(EXPERIMENTS, "notebook 08"),
+        BUDGET: optional(BUDGET, "the online budget"),
+        ONE_POLICY: optional(ONE_POLICY, "notebook 09", (1,)),
+        OWN_PLANT: optional(OWN_PLANT, "notebook 07", (1,)),
+        LIMITS: {
+            (*place, part): load_stage(last.folder.with_name(f"limits_{part}"), "notebook 06")
+            for place, last in optional(f"limits_{LIMITS[-1]}", "notebook 06").items()
+            for part in LIMITS
+        },
+        INFERRED: {},
+    }
+    if (path := root / scale / "seed_0" / INFERRED / RECORD).is_file():
+        runs[INFERRED][INFERRED] = load_stage(path.parent, "notebook 00")
     trials = {
         (case, name): optional(offline_folder(record, name), f"the trial '{name}'", (case,))
         for case, record in params.items()
         for name in record.trials
     }
-    limits = {
-        (*place, part): load_stage(last.folder.with_name(f"limits_{part}"), "notebook 06")
-        for place, last in optional(f"limits_{LIMITS[-1]}", "notebook 06").items()
-        for part in LIMITS
-    }
-    path = root / scale / "seed_0" / INFERRED
-    inferred = load_stage(path, "notebook 00") if (path / RECORD).is_file() else None
-    parts: tuple[Mapping[Any, Stage], ...] = (one_policy, own_plant, experiments, budget, *trials.values(), limits)
-    beyond = (*(stage for part in parts for stage in part.values()), *([inferred] if inferred else []))
-    check([*stages.values(), *beyond], root / scale, params_root)
+    runs |= trials
+    changed = stale([*stages.values(), *(stage for run in runs.values() for stage in run.values())], root / scale, params_root)
+    refuse({stage.folder: changed[stage.folder] for stage in stages.values() if stage.folder in changed})
+    left_out = {stage.record["notebook"] for run in runs.values() for stage in run.values() if stage.folder in changed}
+    for name, run in runs.items():
+        runs[name] = {place: stage for place, stage in run.items() if stage.record["notebook"] not in left_out}
+    experiments = runs[EXPERIMENTS]
     known = claims.load_claims(params_root) if experiments else {}
     claim_values = claims.collect(known, stages | {(*place, EXPERIMENTS): stage for place, stage in experiments.items()})
     return Results(
@@ -176,16 +187,17 @@ def collect(
         seeds=seeds,
         claims=claims.verdicts(known, claim_values),
         claim_values=claim_values,
-        budget=stacked(budget, "scores.csv", ("episodes_per_epoch", "objective")).infer_objects(),  # where there are none: objects
-        trials=_trials(params, seeds, trials),
-        inferred=inferred,
-        limits=limits,
-        one_policy=stacked(one_policy, "summary.csv"),
-        own_plant=stacked(own_plant, "scores.csv"),
+        budget=stacked(runs[BUDGET], "scores.csv", ("episodes_per_epoch", "objective")).infer_objects(),  # none: objects
+        trials=_trials(params, seeds, {place: runs[place] for place in trials}),
+        inferred=runs[INFERRED].get(INFERRED),
+        limits=runs[LIMITS],
+        one_policy=stacked(runs[ONE_POLICY], "summary.csv"),
+        own_plant=stacked(runs[OWN_PLANT], "scores.csv"),
         search=load_stage(search_report.FOUND, "make search") if (search_report.FOUND / RECORD).is_file() else None,
-        beyond=beyond,
+        beyond=tuple(stage for run in runs.values() for stage in run.values()),
         made_from=inputs(REPORT, params_root, scale),
         missing=tuple(seed for seed in range(n_seeds) if seed not in seeds_found),
+        left_out=tuple(sorted(left_out)),
     )
 
 

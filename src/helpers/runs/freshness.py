@@ -1,6 +1,6 @@
 """Whether results on disk still are what the present parameters, code, packages and earlier results make."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +13,19 @@ COMMITTED = PROJECT / "notebooks/inputs"  # made at another commit, on another m
 MOST_NAMED = 5  # of the files in one sentence
 
 
-def check(stages: Sequence[Stage], folder: Path, params_root: Path) -> None:
-    """Refuse a mixture: every stage must be made from the parameters, the code, the packages and the earlier results of now.
+def stale(stages: Sequence[Stage], folder: Path, params_root: Path) -> dict[Path, list[str]]:
+    """What has changed since each of the stages was made, by folder; those made from what there is now are not among them.
 
     Args:
         folder: where the stages of all seeds of this scale lie.
 
     Raises:
-        ArtifactError: in one sentence, which names the files that do not fit, and what has changed since they were made.
+        ArtifactError: for a result that does not say what made it.
     """
     committed = folder.parent.resolve() == COMMITTED.resolve()
     content = {stage.folder.relative_to(folder).as_posix(): stage.content for stage in stages}
     now: dict[tuple[str, int | None, str], dict[str, str]] = {}
-    stale: dict[str, list[str]] = {}
+    changed: dict[Path, list[str]] = {}
     for stage in stages:
         record, place = stage.record, stage.folder.relative_to(folder)
         run: dict[str, Any] = {name: record[name] for name in ("notebook", "case", "seed", "scale", "variant") if name in record}
@@ -42,9 +42,21 @@ def check(stages: Sequence[Stage], folder: Path, params_root: Path) -> None:
         if not found and not committed and record.get("identity") != identity(run, now[key], upstream):
             found = ["the record itself"]
         if found:
-            stale.setdefault(", ".join(found), []).append(str(stage.folder / RECORD))
-    if stale:
-        parts = [f"{_some(files)} (changed: {_some(names.split(', '))})" for names, files in stale.items()]
+            changed[stage.folder] = found
+    return changed
+
+
+def refuse(changed: Mapping[Path, list[str]]) -> None:
+    """Refuse a mixture: every one of these stages must be made again.
+
+    Raises:
+        ArtifactError: in one sentence, which names the files that do not fit, and what has changed since they were made.
+    """
+    alike: dict[str, list[str]] = {}
+    for folder, names in changed.items():
+        alike.setdefault(_some(names), []).append(str(folder / RECORD))
+    if alike:
+        parts = [f"{_some(files)} (changed: {names})" for names, files in alike.items()]
         raise ArtifactError(f"{'; '.join(parts)}: made from other inputs than there are now; run them again, or remove them")
 
 

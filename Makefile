@@ -51,7 +51,7 @@ search: setup  ## the best settings of the printed algorithms, and a sample of w
 	printf '1\n2\n' | xargs -n 1 -P $(CORES) $(BIN)/python -m helpers search --scale $(SCALE)
 	$(BIN)/python -m helpers search --scale $(SCALE)
 
-smoke: setup  ## the same in seconds, with few epochs; the report goes to results/smoke/report/
+smoke: setup  ## everything at a tiny scale, in a minute or two, its numbers mean nothing; the report goes to results/smoke/report/
 	$(SNAKEMAKE) $(CORES) --config seeds=1 scale=smoke reports=results/smoke/report
 	@echo "The report of the smoke run: $(CURDIR)/results/smoke/report/report.html"
 

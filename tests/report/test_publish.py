@@ -113,7 +113,7 @@ def test_publishing_copies_the_report_and_the_first_seed_s_notebooks_and_writes_
     assert rows[0] == ["I", "1.0 % [0.9, 1.2]", "10.0 %", "20.0 % [15.0, 31.0]", "40.0 %", "95.1 %"]
     assert rows[1] == ["II", "2.0 %", "13.7 %", "3.0 % [2.0, 4.0]", "–", "–"]
     assert "(ours: medians and 95 % bootstrap intervals of the median over 20 seeds)" in lines
-    assert "and all stages of its 2 seeds took 2.0 hours. With two cores, two stages run at a time." in lines
+    assert "and all that `make evidence` runs for 2 seeds 2.0 hours. With two cores, two stages run at a time." in lines
     running = (project / "docs/running.md").read_text(encoding="utf-8").splitlines()
     assert any("offline_improved" in line and " 20 " in line for line in running)
     kept = [line for line in lines if line in README.splitlines()]

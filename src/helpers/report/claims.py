@@ -2,7 +2,7 @@
 
 The rule: a claim holds where the whole 95 % bootstrap interval of the median over seeds lies on the claimed side of the margin,
 does not hold where no part of it does (two that tie are no better than each other), and cannot be told otherwise, or with fewer
-than five seeds. Where it is one-sided, for it hangs on settings of ours, it holds or cannot be told.
+than five seeds.
 """
 
 from collections.abc import Mapping

@@ -23,8 +23,10 @@ from helpers.runs.policies import TrainedPolicy, rebuilt
 from helpers.runs.sources import PROJECT
 from helpers.settings.paper import Params, load, load_published
 
+LEARNT = "records of the PID and the model of the process, by Algorithms 1 and 2 in our improved variant; not on the plant"
 TRAINED_ON = {
-    "offline": "the records of the PID and the model of the process, by Algorithms 1 and 2 in our variant; not on the plant",
+    "offline": f"the {LEARNT}",
+    "transfer": f"the weights and the offline policy of Case Study I, then the {LEARNT}",
     "online": "the offline policy of its case and simulated episodes of the plant, for the tracking objective",
     ONE_POLICY: "the model of the process, by the gradient through it, for set points drawn from the range below; not on the plant",
 }
@@ -99,7 +101,7 @@ def _card(kind: str, record: Mapping[str, Any], params: Params, state: Mapping[s
     low, high = (state.get("centre", target) + sign * state.get("reach", 0 * target) for sign in (-1, 1))
     return {
         "title": "One policy for all case studies." if kind == ONE_POLICY else f"{params.case.title}; after {kind} learning.",
-        "trained_on": TRAINED_ON[kind],
+        "trained_on": TRAINED_ON["transfer" if kind == "offline" and params.case.offline.transfer_from else kind],
         **{key: record[key] for key in ("notebook", "seed", "scale", "revision")},
         "set_point_range": dict(zip(process.controlled, torch.stack([low, high], dim=1).tolist(), strict=True)),
         "input_range": {

@@ -117,8 +117,9 @@ def cost(time: pd.DataFrame, provenance: Mapping[str, Any]) -> str:
     """README's sentence on what the run has cost, from tables/time.csv and its provenance."""
     minutes, hours = time["seconds"].sum() / 60, provenance["stage_seconds"] / 3600
     return (
-        f"On the machine of the published run, the stages of one seed took {minutes:.1f} minutes of processor time,\n"
-        f"and all stages of its {len(provenance['seeds'])} seeds took {hours:.1f} hours. With two cores, two stages run at a time."
+        f"On the machine of the published run, what `make reports` runs took {minutes:.1f} minutes of processor time,\n"
+        f"and all that `make evidence` runs for {len(provenance['seeds'])} seeds {hours:.1f} hours. "
+        "With two cores, two stages run at a time."
     )
 
 

@@ -2,13 +2,15 @@
 
 import io
 
-COLOURS = 128  # of a PNG: a third of the size, and no difference that the eye sees
+COLOURS = 256  # of a PNG: a third of the size
 
 
 def smaller(png: bytes) -> bytes:
-    """The PNG with a palette of its own, if that is smaller."""
+    """The PNG with a palette of its most frequent colours, if that is smaller; areas keep theirs, edges of lines take the nearest."""
     from PIL import Image  # noqa: PLC0415  # a run without pictures starts without it
 
-    palette, found = Image.open(io.BytesIO(png)).convert("RGB"), io.BytesIO()
-    palette.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(found, format="PNG", optimize=True)
+    picture, palette, found = Image.open(io.BytesIO(png)).convert("RGB"), Image.new("P", (1, 1)), io.BytesIO()
+    counted = sorted(picture.getcolors(picture.width * picture.height), reverse=True)
+    palette.putpalette([channel for _, colour in counted[:COLOURS] for channel in colour])
+    picture.quantize(palette=palette, dither=Image.Dither.NONE).save(found, format="PNG", optimize=True)
     return min(png, found.getvalue(), key=len)

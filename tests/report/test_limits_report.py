@@ -46,7 +46,7 @@ def write(folder, level):
     values = {"iae:T": level, "rise_time:T": 0.2, "settling_time_5:T": None, "offset:T": 0.012, "overshoot_single:T": 0.1}
     values |= {"harris:T": 0.9}
     quality = pd.DataFrame({"controller": "mpc", "figure": list(values), "value": list(values.values())})
-    lost = {"controller": "ppo", "figure": ["rise_time:C_A", "rise_time:T", "overshoot:C_A"], "value": [None, 0.2, 0.0]}
+    lost = {"controller": "ppo", "figure": ["offset:C_A", "rise_time:T", "overshoot:C_A"], "value": [-1.5, 0.2, 0.0]}
     quality = pd.concat([quality, pd.DataFrame(lost)])
     save_stage(folder / "limits_quality", {}, {"quality.csv": quality})
     there = (("expert", 10.0, 10.0), ("mpc", 10.0, 20.0), ("online", 8.0, 16.0))
@@ -151,6 +151,9 @@ def test_what_one_seed_says(results):
         "never_below": ["offset-free MPC"],
         "least": (40.0, 40.0),
         "without_model": {500: {"PPO from scratch": [1, 2]}},
+        "budget": 500,
+        "steady": ["IRL, then policy gradient"],
+        "kept": 0.9,
     }
     assert found["not_found"] == {case: ["PPO from scratch ($C_A^*$)"] for case in (1, 2)}  # loops that it never found
     ranges = "A and B times 1 to 2 and 0.7 to 1; the set points of the two loops times 1.25 to 1.25 and 1 to 1"
@@ -190,7 +193,8 @@ def test_the_section_of_the_template(results):
     rendered = typesetting.numbered(template.render(shown, rivals={}, one_policy=()))
     assert "10.0 [9.0, 11.0]" in rendered
     assert "](figures/limits_budget.svg)" in rendered
-    assert "reaches\n  150.0 and 81.8 % of the objective of the best learner after its last one in Case Studies" in rendered
-    assert "- all but offset-free MPC on A x 1.3, B x 0.7 in Case Study I;\n- all controllers on" in rendered
+    assert "reaches\n  150.0 and 81.8 % of the objective of the best learner after 500 episodes in Case Studies" in rendered
+    assert "On the plant with A x 1.3, B x 0.7, by the whole interval" in rendered
+    assert "- all but offset-free MPC in Case Study I;\n- all controllers in Case Study II" in rendered
     assert "in Case Study II (where no input within the bounds holds the set point)." in rendered
     assert template.render(limits={}).strip() == ""

@@ -13,16 +13,16 @@ def answer(found: pd.DataFrame, budget: pd.DataFrame) -> str:
 
     Args:
         found: columns objective and gap (per cent below the programme), index controller.
-        budget: the objective of each learner (index) after so many episodes (columns).
+        budget: the objective of each learner (index) after so many episodes (columns), and of those that spend none; fewer draws.
     """
     learners = budget.drop(index=[name for name in NO_LEARNERS if name in budget.index])
     lines = []
-    for episodes in budget.columns:
+    for episodes in (number for number in budget.columns if int(number)):
         best = learners[episodes].idxmax()
         lines.append(f"after {episodes:,} episodes {LABELS[best]} is best, $J$ = {learners.loc[best, episodes]:.1f}")
     model = {name: found.loc[name] for name in WITH_MODEL if name in found.index}
     known = ", ".join(f"{LABELS[name]} {row['objective']:.1f} ({row['gap']:.1f} %)" for name, row in model.items())
-    ahead = learners.columns[(learners > found.loc["mpc", "objective"]).any()]
+    ahead = learners.columns[(learners > budget.loc["mpc"]).any()]
     passed = f"from {ahead[0]:,} episodes on" if len(ahead) else "at none of these budgets"
     best = learners.iloc[:, -1].idxmax()
     return (

@@ -24,7 +24,7 @@ LABELS = {
     "online_there": "improved on that plant",
     "clone": "cloning",
     "irl_reinforce": "IRL, then policy gradient",
-    "irl_alone": "IRL, then REINFORCE alone",
+    "irl_alone": "IRL, then policy gradient without critic",
     "clone_reinforce": "cloning, then policy gradient",
     "csil_reinforce": "CSIL, then policy gradient",
     "scratch_reinforce": "policy gradient from scratch",

@@ -8,8 +8,10 @@ from helpers.report.limits_figures import LABELS, LEARNERS, RIVALS
 from helpers.report.statistics import FEWEST, median_interval
 from helpers.report.tables import symbol
 
+STEADY = 0.9
+LOST = 0.2  # of the set point change: an offset of a loop that was not found
 TUNED = 1.05  # of the objective it began with, for a search to have found other gains
-END_IN_REINFORCE = ("online", "irl_reinforce", "irl_alone", "clone_reinforce", "csil_reinforce", "scratch_reinforce")
+END_IN_GRADIENT = ("online", "irl_reinforce", "irl_alone", "clone_reinforce", "csil_reinforce", "scratch_reinforce")
 
 
 def find(results: Results) -> dict[str, Any]:
@@ -52,7 +54,7 @@ def agreement(results: Results) -> float:
 
 
 def standings(results: Results) -> dict[int, dict[str, dict[str, list[int]]]]:
-    """By budget and rival: the cases in which the paper's learner is ahead of it, behind it, or where the seeds cannot tell.
+    """By budget and rival: the cases in which IRL, then policy gradient, is ahead of it, behind it, or where the seeds cannot tell.
 
     Cases with too few seeds for an interval are left out.
     """
@@ -77,8 +79,9 @@ def practice(results: Results) -> dict[str, Any]:
     """What helps to choose.
 
     with_model: by case, minimum variance on y in per cent of the best learner at the last budget; never_below: the controllers
-    that no condition puts below the PID; least: the range of what those that end in REINFORCE keep of the PID's objective at other
-    set points, in per cent; without_model: by budget the best that needs none, with its cases. All in the median.
+    that no condition puts below the PID; least: the range of what those that end in a policy gradient keep of the PID's objective
+    at other set points, in per cent; without_model: by budget the best that needs none, with its cases; budget: the last one. All
+    in the median; but steady: the learners that with every seed keep `STEADY` of the best median in each case.
     """
     listed = limits_report.listed_budgets(results).astype({"metric": int})
     medians = listed.groupby(["case", "metric", "learner"])["value"].median()
@@ -90,23 +93,30 @@ def practice(results: Results) -> dict[str, Any]:
             with_model[int(case)] = 100 * reached[case, "minimum_variance"] / row.reindex(LEARNERS).max()
         if budget and (others := row.reindex(RIVALS).dropna()).size:
             without_model.setdefault(int(budget), {}).setdefault(LABELS[others.idxmax()], []).append(int(case))
+    last = listed[(listed["metric"] == max(listed["metric"])) & listed["learner"].isin(LEARNERS)].groupby(["case", "learner"])[
+        "value"
+    ]
+    steady = (last.min() / last.median().groupby("case").transform("max") >= STEADY).groupby("learner").all()
     shares = limits_report.worst(results)
     kept = shares.pivot_table(index="controller", columns=["case", "group"], values="value", aggfunc="median").drop(index="expert")
-    points = shares[(shares["group"] == "set_point") & shares["controller"].isin(END_IN_REINFORCE)]
+    points = shares[(shares["group"] == "set_point") & shares["controller"].isin(END_IN_GRADIENT)]
     least = points.groupby(["case", "controller"])["value"].median()
     return {
         "with_model": with_model,
         "never_below": [LABELS[name] for name in LABELS if name in kept.index and (kept.loc[name] >= 100).all()],
         "least": (least.min(), least.max()),
         "without_model": without_model,
+        "budget": int(max(listed["metric"])),
+        "steady": [LABELS[name] for name in LEARNERS if steady.get(name, False)],
+        "kept": STEADY,
     }
 
 
 def not_found(results: Results) -> dict[int, list[str]]:
-    """By case, the learners with a loop whose mean response comes to no 90 % of the change in most seeds, and that loop."""
+    """By case, the learners with a loop whose mean response ends further off than `LOST` in most seeds, and that loop."""
     quality = limits_report.read(results, "quality", "quality.csv")
-    rises = quality[quality["figure"].str.startswith("rise_time:") & quality["controller"].isin(LEARNERS)]
-    missed = rises.assign(missed=rises["value"].isna()).groupby(["case", "controller", "figure"], sort=False)["missed"].mean()
+    ends = quality[quality["figure"].str.startswith("offset:") & quality["controller"].isin(LEARNERS)]
+    missed = ends.assign(missed=ends["value"].abs() > LOST).groupby(["case", "controller", "figure"], sort=False)["missed"].mean()
     found: dict[int, list[str]] = {}
     for case, controller, figure in missed[missed > 0.5].index:
         found.setdefault(int(case), []).append(f"{LABELS[controller]} ({symbol(figure.partition(':')[2])})")
@@ -150,19 +160,19 @@ def out_of_reach(results: Results) -> dict[str, list[int]]:
     return found
 
 
-def there(results: Results) -> dict[str, dict[int, list[str]]]:
-    """By mismatched plant and case, the controllers that improving on that plant is not ahead of.
+def there(results: Results) -> dict[str, dict[int, list[str] | None]]:
+    """By mismatched plant and case, the controllers that improving on that plant is not ahead of; None where it is ahead of none.
 
     By the whole interval of the difference within seeds; nothing for too few seeds.
     """
-    found: dict[str, dict[int, list[str]]] = {}
+    found: dict[str, dict[int, list[str] | None]] = {}
     for (plant, case), rows in limits_report.on_mismatch(results).groupby(["plant", "case"], sort=False):
         reached = rows.pivot_table(index="seed", columns="controller", values="objective")
         if len(reached) >= FEWEST:
             others = [name for name in LABELS if name in reached and name != "online_there"]
             ahead_by = {name: (reached["online_there"] - reached[name]).dropna().to_numpy() for name in others}
             behind = [LABELS[name] for name, differences in ahead_by.items() if median_interval(differences)[0] <= 0]
-            found.setdefault(plant, {})[int(case)] = behind
+            found.setdefault(plant, {})[int(case)] = behind if len(behind) < len(others) else None
     return found
 
 

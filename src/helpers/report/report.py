@@ -74,7 +74,7 @@ def draw(results: Results, compared: pd.DataFrame) -> dict[str, Figure]:
         response = results.table(case, ONLINE, "response.csv")
         drawn[f"control_case_{case}"] = figures.control_figure(response, outputs, inputs, target, descriptions)
         if params is first:
-            look: dict[str, Any] = {"zoom_from": None, "size": (verdict_figures.NARROW, 3.9), "agent_label": "improved policy"}
+            look: dict[str, Any] = {"zoom_from": None, "size": (verdict_figures.NARROW, 3.9), "agent_label": "online policy"}
             keys = ["controller", "kind", "variable", "time_index"]
             middle = response.groupby(keys, sort=False, as_index=False)[["mean", "std"]].median()
             drawn["page_one"] = figures.control_figure(middle, outputs, inputs, target, **look)
@@ -270,6 +270,7 @@ def said(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mappin
         "of_the_paper": {case: OF_THE_PAPER[f"control_case_{case}"] for case in results.params},
         "benchmarks": benchmarks,
         "claims": tabulated.get("claims_by_case"),
+        "changed_claims": results.claims.loc[results.claims["changed"].fillna("") != "", "id"].nunique(),
         "search": tabulated["search"].set_index("case").to_dict("index") if "search" in tabulated else {},
         "frozen": _frozen(results),
         "limits": limits,
@@ -293,11 +294,12 @@ def said(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mappin
     }
 
 
-def _frozen(results: Results) -> dict[str, dict[int, float]] | None:
-    """The gap of a policy that learned from scratch under the weights held fixed, by case, where it was run."""
-    found = results.claims[results.claims["id"] == "weights_explain_the_expert"]
-    found = found[found["quantity"].str.contains("our weights")].set_index("case")[["median"]]
-    return found.to_dict() if len(found) and found.notna().all(axis=None) else None
+def _frozen(results: Results) -> dict[str, list[float]] | None:
+    """The gaps, in per cent and by case, of policies that learned from scratch under weights held fixed, ours and the printed."""
+    found = results.claims[results.claims["id"] == "weights_explain_the_expert"].sort_values("case")
+    whose = found["quantity"].str.contains("our weights").map({True: "ours", False: "printed"})
+    gaps = (100 * found["median"]).groupby(whose).agg(list).to_dict()
+    return gaps if len(found) and found["median"].notna().all() else None
 
 
 def _holding(params: Params) -> float:
@@ -318,12 +320,13 @@ def _settings(parameters: pd.DataFrame, status: str, part: int) -> str:
 def _better(results: Results) -> dict[str, list[int]]:
     """The cases in which ours is better beyond its interval: the gap below the paper's, online J above the PID's.
 
-    printed and worse_as_printed: those in which the gap of the algorithms as printed lies below the paper's, and above it.
+    worse: those in which the gap lies above the paper's; printed and worse_as_printed: the same of the algorithms as printed.
     """
     low, high = (results.numbers[end].fillna(results.numbers["median"]) for end in ("ci_low", "ci_high"))
     papers = {case: record.feature_gap for case, record in results.published.items()}
     return {
         "gap": [case for case in papers if high[case, "offline", "feature_gap"] < papers[case]],
+        "worse": [case for case in papers if low[case, "offline", "feature_gap"] > papers[case]],
         "printed": [case for case in papers if high[case, "offline_printed", "feature_gap"] < papers[case]],
         "worse_as_printed": [case for case in papers if low[case, "offline_printed", "feature_gap"] > papers[case]],
         "online": [

@@ -148,7 +148,7 @@ def variants_table(medians: pd.DataFrame) -> pd.DataFrame:
         gap = 100 * found.loc["feature_gap", ["median", "ci_low", "ci_high", "greatest"]].astype(float)
         row = {"case": ROMAN[int(case) - 1], "learning": LEARNING[stage], "seeds": found.loc["feature_gap", "n_seeds"]}
         row |= {"feature gap, %": spread(gap, decimals=1), "worst seed, %": _number(gap["greatest"], decimals=1)}
-        rows.append(row | {name.replace("_", " "): int(found.loc[name, "median"]) for name in COSTS})
+        rows.append(row | {name.replace("_", " "): round(found.loc[name, "median"]) for name in COSTS})
     return pd.DataFrame(rows).sort_values(["case", "learning"], ignore_index=True)
 
 

@@ -194,7 +194,7 @@ def test_comparison_has_one_row_for_each_published_number(written):
     assert table[["published", "reproduced"]].notna().all(axis=None)
     assert table[["ci_low", "ci_high", "pred_low", "pred_high"]].isna().all(axis=None)
     assert set(table["verdict"]) == {"fitted", "cannot tell"}
-    assert set(table["reason"]) == {"one seed"}
+    assert set(table["reason"]) == {"one seed", "settings inferred from it"}
     found = table.set_index(["case", "row", "feature"])
     assert found.loc[(1, "expert", "C_A-I"), "published"] == 21.63  # Table 2, first and last number of the paper
     assert found.loc[(3, "alpha", "T-III"), "published"] == -0.541

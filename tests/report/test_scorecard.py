@@ -60,7 +60,7 @@ def compare(runs: pd.DataFrame, published=None, names=None) -> pd.DataFrame:
         ("policy", 10.0, 1, np.nan, np.nan, "cannot tell", "one seed"),
         ("expert", 10.0, 20, 9.0, 9.6, "fitted", "0.4 above the interval"),  # whatever its interval says
         ("expert", 10.0, 20, 0.0, 20.0, "fitted", "inside 0.00 to 20.00"),
-        ("expert", 10.0, 1, np.nan, np.nan, "fitted", "one seed"),
+        ("expert", 10.0, 1, np.nan, np.nan, "fitted", "settings inferred from it"),
         ("alpha", 10.0, 0, np.nan, np.nan, "cannot tell", "no seed gave it"),
         ("alpha", 0.5, 2, 0.4, 0.501, "match", "inside 0.400 to 0.501"),
     ],

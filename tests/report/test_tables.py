@@ -98,7 +98,7 @@ def test_quality_table_has_a_row_for_each_figure_of_merit_and_a_column_for_each_
     assert table.loc["$J$ on $x$, % of minimum variance", "online policy"] == "90.0 [81.0, 99.0]"
     assert table.loc["overshoot $T^*$, %", "online policy"] == "2.0 [1.8, 2.2]"
     assert table.loc["movement $T_E^*$", "online policy"] == "321 [289, 353]"
-    assert table.loc["episodes spent", "online policy"] == "2000 [1800, 2200]"
+    assert table.loc["plant episodes spent", "online policy"] == "2000 [1800, 2200]"
     assert len(table) == 3 + 2 * 3 + 2 + 1
 
 

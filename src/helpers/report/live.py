@@ -18,7 +18,7 @@ CONTROLLERS = LOOP_COLOURS[:1] + LOOP_COLOURS[2:]  # without that of the set poi
 
 
 def elsewhere(study: Study, set_point: Sequence[float], disturbance: float = 1.0, noise: float = 1.0) -> Study:
-    """The case at a set point, (n_y,) in deviation variables, with its disturbance and measurement error times a factor each.
+    """The case at a set point, (n_y,) in deviation variables, with its disturbance and observation noise times a factor each.
 
     Errors are still counted in the units of the case's own set point, so that objectives can be compared.
     """
@@ -80,7 +80,7 @@ def panel(study: Study, policies: Mapping[str, LSTMPolicy]) -> widgets.VBox:
     }
     factors = {
         name: widgets.FloatSlider(1.0, min=0.0, max=4.0, step=0.25, description=f"{what} ×", **style)
-        for name, what in (("disturbance", "disturbance"), ("noise", "measurement error"))
+        for name, what in (("disturbance", "disturbance"), ("noise", "observation noise"))
     }
 
     def show(disturbance: float, noise: float, **set_point: float) -> None:

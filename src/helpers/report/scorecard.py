@@ -103,7 +103,8 @@ def verdict(row: str, published: float, n_seeds: int, low: float, high: float) -
         low, high: 95 % prediction interval for one run.
     """
     if n_seeds < 2:
-        return ("fitted" if row == FITTED else "cannot tell"), ("one seed" if n_seeds else "no seed gave it")
+        why = "one seed" if n_seeds else "no seed gave it"
+        return ("fitted", "settings inferred from it") if row == FITTED else ("cannot tell", why)
     decimals, reach = RESULT_DECIMALS[row], (high - low) / 2
     inside = low <= published <= high
     if inside:

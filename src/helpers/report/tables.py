@@ -125,13 +125,14 @@ def quality_table(medians: pd.DataFrame, process: ProcessParams) -> pd.DataFrame
         labels |= {f"{what}:{name}": (f"{what} {symbol(name)}, %", 100, 1) for what in ("overshoot", "offset")}
         labels[f"rise_time:{name}"] = (f"rise time {symbol(name)}, time", 1, 2)
     labels |= {f"movement:{name}": (f"movement {symbol(name)}", 1, None) for name in process.manipulated}
-    labels["episodes"] = ("episodes spent", 1, 0)
+    labels["episodes"] = ("plant episodes spent", 1, 0)
     values = medians.set_index(["metric", "stage"])[["median", "ci_low", "ci_high"]]
     rows = []
     for metric, (label, factor, decimals) in labels.items():
         row = {"figure of merit": label}
         for stage, name in CONTROLLERS.items():
-            row[name] = spread(factor * values.reindex([(metric, stage)]).iloc[0], decimals=decimals)
+            of_the_model = metric == "episodes" and stage == "offline"
+            row[name] = NOT_KNOWN if of_the_model else spread(factor * values.reindex([(metric, stage)]).iloc[0], decimals=decimals)
         rows.append(row)
     return pd.DataFrame(rows)
 

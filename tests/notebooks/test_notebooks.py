@@ -203,7 +203,7 @@ def test_changed_numbers_fail_and_changed_style_and_last_digits_pass(tmp_path):
         "elsewhere(session, target)", "_ = [line.set(color='black', linewidth=4) for axis in shown.axes for line in axis.lines]"
     )
     plotted = copy.shown(
-        'measurement error × 3"], ', "shown.axes[0].lines[0].set_ydata(shown.axes[0].lines[0].get_ydata() * 1.001)"
+        'observation noise × 3"], ', "shown.axes[0].lines[0].set_ydata(shown.axes[0].lines[0].get_ydata() * 1.001)"
     )
     status, failed, said = copy.run()
     assert status == 1, said

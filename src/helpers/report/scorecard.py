@@ -103,8 +103,8 @@ def verdict(row: str, published: float, n_seeds: int, low: float, high: float) -
         low, high: 95 % prediction interval for one run.
     """
     if n_seeds < 2:
-        why = "one seed" if n_seeds else "no seed gave it"
-        return ("fitted", "settings inferred from it") if row == FITTED else ("cannot tell", why)
+        one = ("fitted", "settings inferred from it") if row == FITTED else ("cannot tell", "one seed")
+        return one if n_seeds else (one[0], "no seed gave it")
     decimals, reach = RESULT_DECIMALS[row], (high - low) / 2
     inside = low <= published <= high
     if inside:

@@ -182,3 +182,11 @@ def test_markdown_text_is_typeset_or_escaped() -> None:
     ):
         assert line.startswith(f"| {expected} ")
     assert [row[-1] for row in cells("\n".join(lines[2:]))] == ["yes", "no"] * 3
+
+
+def test_fitted_settings_are_told_in_words_and_a_gain_of_no_size_is_none():
+    places = [("sampling_time", "-", 0.04), ("input_bound", "C_A0", 20.0), ("PID1.derivative", "T", 7e-11)]
+    found = [{"setting": name, "component": of, "value": value, "low": 0.0, "high": 50.0} for name, of, value in places]
+    table = tables.inferred_settings(pd.DataFrame(found).assign(identified="yes", in_parameter_files=1.0))
+    assert table["setting"].tolist() == ["sampling time", "bounds ±, $C_{A0}^*$", "PID1 derivative gain, $T^*$"]
+    assert table["best value"].tolist() == [0.04, 20.0, 0.0]

@@ -147,6 +147,7 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     if results.inferred is not None:
         for name in ("settings", "hypotheses", "prediction"):
             tabulated[f"inferred_{name}"] = results.inferred.table(f"{name}.csv")
+        tabulated["inferred_settings"] = tables.inferred_settings(tabulated["inferred_settings"])
         tabulated["inferred_errors"] = scorecard.held_out(tabulated["inferred_prediction"])
         tabulated["inferred_hypotheses"] = tabulated["inferred_hypotheses"].replace({"reading": {MAIN.name: OWN_ERROR}})
         errors = scorecard.sampling_errors(tabulated["inferred_prediction"], results.published)

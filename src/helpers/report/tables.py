@@ -38,6 +38,10 @@ def case_study(case: int) -> str:
     return f"Case Study {ROMAN[case - 1]}"
 
 
+BOUNDS = {"input_bound": "bounds ±", "input_low": "lower bound", "input_high": "upper bound"}  # settings of notebook 00 in words
+NOISE = 1e-6  # a fitted gain below it is none
+
+
 def symbol(name: str) -> str:
     """A variable in TeX: C_A0 becomes $C_{A0}^*$; the star marks a deviation variable, as in the paper."""
     letter, _, index = name.partition("_")
@@ -50,6 +54,25 @@ def feature_symbol(name: str) -> str:
     """A feature with its variable in TeX: C_A-I becomes $C_A^*$-I."""
     variable, _, kind = name.rpartition("-")
     return f"{symbol(variable)}-{kind}"
+
+
+def setting_words(setting: str, component: str) -> str:
+    """A setting of notebook 00 as a reader knows it: PID1.integral of T becomes PID1 integral gain, $T^*$."""
+    controller, _, kind = setting.rpartition(".")
+    words = f"{controller} {kind} gain" if controller else BOUNDS.get(kind, kind.replace("_", " "))
+    return words if component == "-" else f"{words}, {symbol(component)}"
+
+
+def inferred_settings(settings: pd.DataFrame) -> pd.DataFrame:
+    """The settings that notebook 00 fitted, in words.
+
+    Args:
+        settings: its settings.csv, columns setting, component, value, low, high, identified, in_parameter_files.
+    """
+    names = [setting_words(*place) for place in settings[["setting", "component"]].itertuples(index=False)]
+    numbers = settings[["value", "low", "high", "in_parameter_files"]]
+    found = settings.assign(setting=names, **numbers.where(numbers.abs() > NOISE, 0.0))
+    return found.drop(columns="component").rename(columns={"value": "best value"})
 
 
 def table_1(cases: Mapping[int, CaseParams], process: ProcessParams) -> pd.DataFrame:

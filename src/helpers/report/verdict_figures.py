@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
 from helpers.report.figures import INK, MUTED, WIDTH, empty_figure, feature_styles, head
-from helpers.report.tables import ROMAN, feature_symbol, symbol
+from helpers.report.tables import ROMAN, feature_symbol, setting_words, symbol
 
 # Colour and shape of a verdict, so that it can be read without colours.
 MARKS: dict[str, dict[str, Any]] = {
@@ -28,7 +28,6 @@ ROWS = {"expert": "PID, features", "policy": "policy, features", "alpha": "weigh
 LINEAR = 10.0  # per cent to either side of the published value that are drawn to scale; beyond, by powers of ten
 SMOOTH = 0.05  # of all epochs, over which a curve of weights is averaged
 NARROW = 7.6  # inches, of a picture on page one
-BOUNDS = {"input_bound": "bounds ±", "input_low": "lower bound", "input_high": "upper bound"}  # settings of notebook 00 in words
 
 
 def _handles(verdicts: Iterable[str], found: Iterable[str]) -> list[Line2D]:
@@ -179,10 +178,7 @@ def profiles_figure(profiles: pd.DataFrame, settings: pd.DataFrame) -> Figure:
         axes.plot(value[shown], root[shown] ** 2, "o", color=INK, markersize=3.5, label="fitted again")
         filed: Any = {"color": MARKS["differs"]["color"], "linestyle": ":", "linewidth": 2}
         axes.axvline(row.in_parameter_files, label="in the parameter files", **filed)
-        kind, _, of = row.setting.rpartition(".")
-        words = f"{kind} {of} gain".strip() if kind else BOUNDS.get(of, of.replace("_", " "))
-        loop = f", {symbol(row.component)}" if row.component != "-" else ""
-        axes.set_title(f"{words}{loop}", fontsize=9, loc="left")
+        axes.set_title(setting_words(row.setting, row.component), fontsize=9, loc="left")
         axes.set_ylim(bottom=0)
         axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.set_label(f"{row.setting} {row.component}")

@@ -91,6 +91,16 @@ def test_what_follows_from_the_limits_is_what_the_reference_run_shows():
     assert kept[kept >= 100].index.tolist() == ["offset-free MPC"]
 
 
+@published
+def test_what_is_said_of_fit_and_search_is_what_the_reference_holds():
+    page = " ".join(PAGES["docs/evidence.md"].split())
+    losses = pd.read_csv(REFERENCE / "inferred_settings/hypotheses.csv").set_index("reading")["loss_2_4"]
+    adopted = losses.iloc[0]  # four steps a sample
+    assert f"leave a loss of {adopted:.1f} where one leaves {losses['1 step a sample']:.1f}" in page
+    trials = pd.read_csv(REFERENCE / "search/trials.csv")
+    assert set(trials.groupby("case")["setting"].nunique()) == {int(re.findall(r"`make search` tries (\d+) in", page)[0])}
+
+
 def anchors(text):
     """The names of a page's headings, as GitHub makes them."""
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in re.findall(r"^#+ (.*)$", text, re.MULTILINE)}

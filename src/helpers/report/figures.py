@@ -131,7 +131,7 @@ def tracking_figure(
     controlled: Sequence[str],
     set_point: Sequence[float],
     descriptions: Mapping[str, str] | None = None,
-    agent_label: str = r"agent $\pi^A$, after offline learning",
+    agent_label: str = r"agent $\pi_\theta$, after offline learning",
     expert_label: str = r"demonstrated $\pi^E$",
 ) -> Figure:
     """Figure 4: the response of each loop over the first interactions, learned against demonstrated."""

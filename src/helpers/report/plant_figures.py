@@ -126,7 +126,7 @@ def validation_figure(validation: Validation, description: PlantDescription) -> 
         right.bar(lags, values, width=0.2, color=INK)
         right.plot(lags, values, "o", color=INK, markersize=3, label="autocorrelation")
         right.set_title(f"{symbol(variable.name)}: residuals, Ljung-Box p = {validation.p_value[index]:.2g}", loc="left")
-        right.set_ylabel("autocorrelation")
+        right.set_ylabel("autocorrelation (no unit)")
         right.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         left.set_label(f"{variable.name} simulated")
         right.set_label(f"{variable.name} residuals")

@@ -22,8 +22,8 @@ CONTROLLERS = {
 LEARNING = {"offline": "improved", "offline_printed": "printed", "offline_scratch": "improved, from scratch"}
 COSTS = ("epochs", "chosen_epoch", "episodes", "gradient_steps")
 TYPESET = {
-    "E[v^E]": r"$\mathbb{E}[v^{\gamma,E}]$",
-    "E[v^pi]": r"$\mathbb{E}[v^{\gamma,\pi}]$",
+    "E[v^E]": r"$\mathbb{E}[v^E]$",
+    "E[v^pi]": r"$\mathbb{E}[v^\pi]$",
     "alpha*": r"$\alpha^*$",
 }
 NOT_KNOWN = "–"

@@ -8,7 +8,7 @@ from helpers.report.limits_figures import LABELS, LEARNERS, RIVALS
 from helpers.report.statistics import FEWEST, median_interval
 from helpers.report.tables import symbol
 
-STEADY = 0.9
+STEADY = 0.9  # of the best median of a case
 LOST = 0.2  # of the set point change: an offset of a loop that was not found
 TUNED = 1.05  # of the objective it began with, for a search to have found other gains
 END_IN_GRADIENT = ("online", "irl_reinforce", "irl_alone", "clone_reinforce", "csil_reinforce", "scratch_reinforce")
@@ -93,10 +93,9 @@ def practice(results: Results) -> dict[str, Any]:
             with_model[int(case)] = 100 * reached[case, "minimum_variance"] / row.reindex(LEARNERS).max()
         if budget and (others := row.reindex(RIVALS).dropna()).size:
             without_model.setdefault(int(budget), {}).setdefault(LABELS[others.idxmax()], []).append(int(case))
-    last = listed[(listed["metric"] == max(listed["metric"])) & listed["learner"].isin(LEARNERS)].groupby(["case", "learner"])[
-        "value"
-    ]
-    steady = (last.min() / last.median().groupby("case").transform("max") >= STEADY).groupby("learner").all()
+    last = listed[(listed["metric"] == max(listed["metric"])) & listed["learner"].isin(LEARNERS)]
+    ends = last.groupby(["case", "learner"])["value"]
+    steady = (ends.min() / ends.median().groupby("case").transform("max") >= STEADY).groupby("learner").all()
     shares = limits_report.worst(results)
     kept = shares.pivot_table(index="controller", columns=["case", "group"], values="value", aggfunc="median").drop(index="expert")
     points = shares[(shares["group"] == "set_point") & shares["controller"].isin(END_IN_GRADIENT)]

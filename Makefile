@@ -86,7 +86,7 @@ torture: setup  ## the slow tests; kill a run KILLS times, crowd notebooks, feed
 	$(BIN)/python -m pytest --numprocesses $(CORES) --dist loadfile -m torture
 	$(BIN)/python -m torture.torture --kills $(KILLS)
 
-plants: setup  ## judge what is learned from the records of eight plants on the plants themselves; an hour; writes reports/reference/plants.md
+plants: setup  ## judge what is learned from the records of eight plants on the plants themselves; half an hour of processor time; writes reports/reference/plants.md
 	$(BIN)/python -m torture.plants --cores $(CORES)
 
 cluster: setup  ## as root on Debian: install SLURM, run the smoke scale through it, compare, stop it (ACCOUNTING=1: with a database)

@@ -154,7 +154,7 @@ def summary(
         f"{best[SIDE_BY_SIDE]:,.0f} steps a second, {best[BOUND] / best[SIDE_BY_SIDE]:.2f} times as long a step as the bound.",
         to_markdown(compared[[*COLUMNS[:9]]], digits=3),
         "Time and memory of an epoch as powers of its size:",
-        to_markdown(fits[["quantity", "against", "exponent"]], digits=3),
+        to_markdown(fits.replace({"seconds": "time", "peak_mb": "peak memory"})[["quantity", "against", "exponent"]], digits=3),
         f"At K = {largest['K']:,} and T = {largest['T']}, learning takes {largest['peak_mb']:,.0f} MB beside what Python and torch "
         "take alone.",
     ]

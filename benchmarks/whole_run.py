@@ -20,7 +20,7 @@ FIXED_COSTS = {  # what every stage pays: commands of one process each
     "import of the stage's command line": "import helpers.runs.run",
     "import of torch": "import torch",
     "import of the notebooks' modules": "import helpers.runs.session, helpers.runs.study, helpers.report.figures",
-    "import of the report's modules": "import helpers.report",
+    "import of the report's modules": "import helpers.report.report",
 }
 
 

@@ -74,6 +74,12 @@ def study(root: Path) -> Callable[..., Case]:
     return build
 
 
+@pytest.fixture
+def case(study: Callable[..., Case]) -> Case:
+    """Case study I as the files have it."""
+    return study()
+
+
 @pytest.fixture(scope="session")
 def synthetic(root: Path) -> Callable[..., Case]:
     """A made-up stable process with any number of controlled and manipulated variables, without noise where asked."""

@@ -17,6 +17,7 @@ from helpers.runs.request import PROJECT
 from helpers.settings.evidence import load_identification
 from helpers.settings.leaf import ParameterError
 from helpers.settings.paper import load
+from tests.plant.test_rollout import plain_loop
 
 ROOT = PROJECT / "params"
 CASES = {case: load(ROOT, case) for case in (1, 2, 3)}
@@ -70,24 +71,6 @@ def test_the_exact_drift_is_the_solution_of_the_undisturbed_equation():
     step = LinearProcess(exact_drift(process), torch.float64)
     found = step.step(torch.tensor(x)[None], torch.tensor(u)[None], torch.zeros(1, 8).double())[0]
     np.testing.assert_allclose(found.numpy(), solved, rtol=1e-8)
-    euler = LinearProcess(process, torch.float64).step(torch.tensor(x)[None], torch.tensor(u)[None], torch.zeros(1, 8).double())[0]
-    assert np.abs(euler.numpy() - solved).max() > 1e-3
-
-
-def test_finer_steps_keep_the_mean_of_the_exact_drift_and_spread_as_an_integral():
-    """One loop without coupling at rest: x' = a x + b u + d x w has a mean and a second moment in closed form over a sample."""
-    a, b, d, dt, x0, u0 = -4.0, 0.5, 0.5, 0.04, 1.0, 20.0
-    update = {"drift_state": ((a, 0.0), (0.0, a)), "drift_input": ((b, 0.0), (0.0, b)), "disturbance": (d, d)}
-    update |= {"sampling_time": dt, "integration_steps": 16}
-    generator = torch.Generator().manual_seed(0)
-    finer = ReadProcess(FIRST.process.model_copy(update=update), MAIN, generator)
-    ones = torch.ones(200_000, 2, dtype=torch.float64)
-    x = finer.step(x0 * ones, u0 * ones, torch.randn(len(ones), finer.n_disturbances, generator=generator, dtype=torch.float64))
-    moments = solve_ivp(
-        lambda _, m: [a * m[0] + b * u0, (2 * a + d**2) * m[1] + 2 * b * u0 * m[0]], (0, dt), [x0, x0**2], rtol=1e-10, atol=1e-12
-    ).y[:, -1]
-    assert x.mean().item() == pytest.approx(moments[0], rel=2e-3)
-    assert x.var().item() == pytest.approx(moments[1] - moments[0] ** 2, rel=2e-2)
 
 
 def test_the_error_of_the_initial_state_takes_the_place_of_the_number(study):
@@ -100,51 +83,23 @@ def test_the_error_of_the_initial_state_takes_the_place_of_the_number(study):
     torch.testing.assert_close(own[:, 4:] - given[:, 4:], (FIRST.features.initial_error - first) / FIRST.process.sampling_time)
 
 
-def one_loop_by_hand(n_steps, reading):
-    """Commands of both loops of case 1 in plain floats, without noise."""
-    process, gains, target = FIRST.process, FIRST.demonstrator, FIRST.case.set_point
-    A, B, dt, m = np.array(process.drift_state), np.array(process.drift_input), process.sampling_time, process.integration_steps
-    x, total, commands = np.zeros(2), np.zeros(2), []
-    before = np.zeros(2) if reading.derivative_from_zero else None
-    kp, ki, kd = (np.array(getattr(gains, kind)) for kind in GAINS)
-    last = np.array(target) - x
-    for _ in range(n_steps):
-        error, last = (last if reading.delay else np.array(target) - x), np.array(target) - x
-        tried = total + error * dt
-        if reading.bounded_integral:
-            tried = np.clip(ki * tried, process.input_low, process.input_high) / ki
-        seen = tried - (1 - reading.present_error) * error * dt
-        smooth = error if before is None else reading.error_memory * before + (1 - reading.error_memory) * error
-        rate = 0.0 if before is None else (smooth - before) / dt
-        command = kp * error + ki * seen + kd * rate
-        u = np.clip(command, process.input_low, process.input_high)
-        frozen = (u != command) & (np.sign(error) == np.sign(command)) & reading.conditional_integration
-        total, before = np.where(frozen, total, tried), smooth
-        commands.append(command)
-        for _ in range(m):
-            x = x + (A @ x + B @ u) * dt / m
-    return np.array(commands)
-
-
 @pytest.mark.parametrize(
     "changes",
-    [{}]
-    + [{name: True} for name in ("conditional_integration", "derivative_from_zero", "bounded_integral", "delay")]
+    [{name: True} for name in ("conditional_integration", "derivative_from_zero", "bounded_integral", "delay")]
     + [{name: 0.5} for name in ("present_error", "error_memory")],
 )
 def test_the_pid_of_a_reading_without_noise(changes, monkeypatch):
     process = FIRST.process.model_copy(update={"observation_noise": (0.0, 0.0), "disturbance": (0.0, 0.0)})
     calm = replace(FIRST, process=process, case=FIRST.case.model_copy(update={"initial_std": (0.0, 0.0)}))
-    seen, reading = [], Reading(first_error=None, **changes)
+    seen = []
 
     def watched(*arguments):
         seen.append(rollout(*arguments))
         return seen[-1]
 
     monkeypatch.setattr("helpers.evidence.readings.rollout", watched)
-    simulate(calm, {}, reading, 2, draws())
-    expected = one_loop_by_hand(seen[0].n_steps, reading)
-    np.testing.assert_allclose(seen[0].command[:, 0].numpy(), expected, rtol=1e-9, atol=1e-9)
+    simulate(calm, {}, Reading(first_error=None, **changes), 2, draws())
+    np.testing.assert_allclose(seen[0].command[:, 0].numpy(), plain_loop(FIRST, [0.0, 0.0], **changes)[1], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize(

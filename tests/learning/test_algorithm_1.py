@@ -22,6 +22,7 @@ from helpers.learning.learner import (
 from helpers.learning.policy import PolicyController
 from helpers.plant.process import LinearProcess
 from helpers.plant.rollout import rollout, stream
+from tests.plant.test_rollout import CALM
 
 F64 = torch.float64
 
@@ -40,9 +41,6 @@ def settings(study):
     """Learner parameters of the printed variant, with changes."""
     base = study().params.learning.variants["printed"].learner
     return lambda **changes: base.model_copy(update={"patience": 0, **changes})
-
-
-# Returns and baselines
 
 
 @pytest.mark.equation("3.1.5")
@@ -71,9 +69,6 @@ def test_regression_advantage_is_the_residual_of_ridge_regression():
         np.testing.assert_allclose(found[t], future[t] - design @ fit, rtol=1e-9, atol=1e-10)
 
 
-# The policy gradient by exact integration: two steps, one input, no other randomness
-
-
 class Grid(PolicyController):
     """A policy whose exploration runs over the nodes of a quadrature instead of being drawn."""
 
@@ -88,15 +83,16 @@ class Grid(PolicyController):
 
 
 class Integral:
-    """J(theta) = E[G] of a two-step problem by Gauss-Hermite quadrature over both exploration draws.
+    """J(theta) = E[G] of two steps of one input by Gauss-Hermite quadrature over both draws; nothing else is random.
 
     The leaky ReLU is made linear, so that the integrand is smooth and the quadrature exact to rounding.
     """
 
     gamma = 0.9
 
-    def __init__(self, synthetic):
-        case = synthetic(1, 1, n_steps=2, noise=0.0)
+    def __init__(self, study):
+        one_input = {"manipulated": ("u",), "drift_input": ((4.0,), (1.0,)), "input_low": (-4.0,), "input_high": (6.0,)}
+        case = study(process=CALM | one_input | {"horizon": 2}, case_study={"initial_std": (0.0, 0.0)})
         self.task, self.features, self.process = case.task, case.features, case.process
         self.policy = case.policy(hidden_cells=(3, 2), leaky_slope=1.0)
         with torch.no_grad():  # the spread and its gradient should depend on the history too
@@ -144,8 +140,8 @@ OBJECTIVES = {
 
 
 @pytest.fixture(scope="module")
-def problem(synthetic):
-    return Integral(synthetic)
+def problem(study):
+    return Integral(study)
 
 
 @pytest.mark.equation("3.2.1", "3.2.4")
@@ -156,9 +152,6 @@ def test_the_surrogates_gradient_is_that_of_the_expected_return_whatever_the_bas
     found = problem.gradient(partial(ADVANTAGES[name], problem), OBJECTIVES[objective])
     assert np.abs(problem.exact).max() > 0.05
     np.testing.assert_allclose(found, problem.exact, rtol=1e-5, atol=1e-7)
-
-
-# The learner
 
 
 def closeness_reward(case):
@@ -234,9 +227,6 @@ def test_an_entropy_bonus_keeps_exploration_up(study, settings, minibatches):
     assert spread(1.0) > spread(0.0) + 0.003
 
 
-# Early stopping
-
-
 def scripted(levels):
     """A reward whose mean return follows `levels`, one an epoch, with a little spread for the advantage."""
     levels = iter(levels)
@@ -262,9 +252,6 @@ def test_early_stopping_by_patience(case, settings, levels, patience, expected):
     learner = case.learner(case.policy(), 4, 6, settings())
     records = algorithm_1(learner, scripted(levels), 6, patience)
     assert len(records) == learner.epochs == expected
-
-
-# Training that cannot go on
 
 
 class Failing(LinearProcess):

@@ -26,9 +26,6 @@ def weights_of(study):
     return lambda **changes: base.model_copy(update={**plain, "selection_memory": 0.0, **changes})
 
 
-# The gradient
-
-
 @pytest.mark.equation("3.4.1", "3.4.3", "3.4.4", "3.4.5")
 def test_the_gradient_is_that_of_the_mean_log_likelihood():
     """Nine possible trajectories, so that the partition function is a sum; five demonstrations, some seen twice."""
@@ -43,9 +40,6 @@ def test_the_gradient_is_that_of_the_mean_log_likelihood():
     probability = np.exp(features @ alpha) / np.exp(features @ alpha).sum()
     found = maxent_gradient(torch.tensor(features[demonstrations].mean(0)), torch.tensor(probability @ features))
     np.testing.assert_allclose(found, differences(log_likelihood, alpha), rtol=1e-7, atol=1e-9)
-
-
-# The step
 
 
 @pytest.mark.equation("3.4.6")
@@ -70,26 +64,11 @@ def test_the_steps_against_plain_numpy(weights_of, decay, scaled, averaging):
         np.testing.assert_allclose(ascent.result, mean / np.linalg.norm(mean), rtol=1e-10)
 
 
-def test_decay_is_the_gradient_of_a_gaussian_prior(weights_of):
-    """The step moves along the gradient of the log-likelihood plus the log-density of the prior, -decay/(2 kappa) |lambda|^2."""
-    start, features, expert = project(normal(3)), normal(6, 3, seed=1), normal(3, seed=2)
-
-    def log_posterior(raw):
-        return raw @ expert.numpy() - np.log(np.exp(features.numpy() @ raw).sum()) - 0.2 / (2 * 0.01) * raw @ raw
-
-    ascent = WeightAscent(weights_of(step=0.01, decay=0.2, bound=10.0), start, torch.ones(3, dtype=F64))
-    ascent.step(maxent_gradient(expert, torch.softmax(features @ start, 0) @ features))
-    np.testing.assert_allclose((ascent.raw - start) / 0.01, differences(log_posterior, start.numpy()), rtol=1e-6, atol=1e-8)
-
-
 @pytest.mark.parametrize("n_loops", [1, 2, 3])
 def test_initial_weights_give_one_sign_to_each_kind_of_feature(weights_of, n_loops):
     found = initial_weights(weights_of(initial=(1.0, -1.0, -2.0)), n_loops, F64)
     expected = np.repeat([1.0, -1.0, -2.0], n_loops) / np.sqrt(6 * n_loops)
     np.testing.assert_allclose(found, expected, rtol=1e-14)
-
-
-# The outer loop
 
 
 def setting(case, n_episodes=6, total_epochs=6, seed=0, **changes):
@@ -155,18 +134,6 @@ def test_early_stopping_ends_an_iteration_early(study, weights_of):
     learner, expert, start = setting(study(), total_epochs=20, patience=1, learning_rate_start=1e-5, learning_rate_end=1e-5)
     result = algorithm_2(learner, expert, start, weights_of(), 2, 5)
     assert result.records[-1].epochs < 20
-
-
-@pytest.mark.parametrize(("n_controlled", "n_manipulated"), [(1, 1), (3, 2)])
-@pytest.mark.parametrize("variant", ["improved", "printed"])
-def test_any_number_of_variables_and_features(synthetic, n_controlled, n_manipulated, variant):
-    case = synthetic(n_controlled, n_manipulated)
-    params = case.params.learning.variants[variant]
-    learner = case.learner(case.policy(), 8, 4, params.learner)
-    expert = torch.linspace(1, 2, 3 * n_controlled, dtype=F64)
-    result = algorithm_2(learner, expert, initial_weights(params.weights, n_controlled, F64), params.weights, 4, 5)
-    assert result.weights.shape == (3 * n_controlled,)
-    assert [len(record.weights) for record in result.records] == [3 * n_controlled] * 4
 
 
 def test_features_that_are_not_finite_end_training_with_the_epoch(case, weights_of):

@@ -104,26 +104,17 @@ def test_entropy_is_that_of_inputs_measured_by_their_range(study):
 
 @pytest.mark.equation("3.2.3")
 def test_log_probability_and_its_gradient_are_those_of_independent_normal_inputs(case):
-    """Written with scipy, the gradient by finite differences; the rest of a trajectory's density does not depend on the policy."""
-    policy = case.policy(leaky_slope=0.3)
+    """Of scipy, and torch's own gradient through its own LSTM; the rest of a trajectory's density does not depend on the policy."""
+    policy = stirred(case.policy(leaky_slope=0.3))
     batch = episodes(case, policy)
-
-    def log_density():
-        mean, std = numpy_forward(policy, batch.y, batch.u, case.task)
-        return norm.logpdf(batch.command.numpy(), mean, std).sum(-1)
-
     found = policy.log_probability(batch.y, batch.u, batch.command, case.task)
-    np.testing.assert_allclose(found.detach(), log_density(), rtol=0, atol=1e-9)
-    found.sum().backward()
-    for parameter in policy.parameters():
-        values, gradient = parameter.detach().view(-1), parameter.grad.view(-1)
-        for index in (0, len(values) // 2, int(gradient.abs().argmax())):
-            middle, sides = values[index].item(), []
-            for shift in (1e-5, -1e-5):
-                values[index] = middle + shift
-                sides.append(log_density().sum())
-            values[index] = middle
-            assert (sides[0] - sides[1]) / 2e-5 == pytest.approx(gradient[index].item(), rel=1e-4, abs=1e-4)
+    mean, std = numpy_forward(policy, batch.y, batch.u, case.task)
+    np.testing.assert_allclose(found.detach(), norm.logpdf(batch.command.numpy(), mean, std).sum(-1), rtol=0, atol=1e-9)
+    weights = torch.randn(found.shape, generator=stream(0), dtype=F64)
+    expected = torch.distributions.Normal(*policy(batch.y, batch.u, case.task)).log_prob(batch.command).sum(-1)
+    gradients = [torch.autograd.grad((weights * values).sum(), list(policy.parameters())) for values in (found, expected)]
+    for own, torchs in zip(*gradients, strict=True):
+        torch.testing.assert_close(own, torchs, rtol=1e-8, atol=1e-8 * torchs.abs().max().item())
 
 
 @pytest.mark.parametrize(("low", "high"), [((-20.0, -60.0), (20.0, 60.0)), ((-1.0, -5.0), (9.0, 95.0))])

@@ -9,6 +9,7 @@ from helpers.plant.process import LinearProcess
 from helpers.plant.rollout import rollout, stream
 
 F64 = torch.float64
+CALM = {"disturbance": (0.0, 0.0), "observation_noise": (0.0, 0.0)}
 
 
 class Constant:
@@ -113,10 +114,7 @@ class FirstSensorFails(LinearProcess):
 @pytest.mark.equation("3.1.6")
 def test_without_noise_an_episode_is_a_plain_loop(study):
     """y_t observes x_t, u_t acts on y_t, x_{t+1} follows from x_t and the bounded u_t; the PID integrates beyond the bounds."""
-    case = study(
-        process={"disturbance": (0.0, 0.0), "observation_noise": (0.0, 0.0)},
-        case_study={"initial_mean": (0.3, -0.4), "initial_std": (0.0, 0.0)},
-    )
+    case = study(process=CALM, case_study={"initial_mean": (0.3, -0.4), "initial_std": (0.0, 0.0)})
     found = rollout(FirstSensorFails(case.params.process, F64), case.pid, case.task, 2, stream(0, "plain"))
     states, commands = plain_loop(case.params, [0.3, -0.4])
     np.testing.assert_allclose(found.x[:, 1], states, rtol=0, atol=1e-11)
@@ -125,9 +123,6 @@ def test_without_noise_an_episode_is_a_plain_loop(study):
     np.testing.assert_allclose(found.u[:, 1], inputs, rtol=0, atol=1e-8)
     assert torch.equal(found.x[:, 1], found.y[:, 1])
     assert not torch.equal(found.u[:, 1], found.command[:, 1])
-
-
-# Random streams
 
 
 def draw(*arguments, n=1000):

@@ -20,9 +20,9 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 
-from helpers.report.tables import feature_symbol, symbol
+from helpers.report.tables import capital, case_study, feature_symbol, symbol
 from helpers.settings.leaf import DEVIATION
 
 WIDTH = 9.0  # inches; at the 100 dpi of a screen the 900 pixels of the report
@@ -63,7 +63,7 @@ SET_POINT = "#ff8c00"
 LEVEL = "#00682f"  # horizontal lines to compare with are the expert's, mostly
 LINE_STYLES: dict[str, Any] = {"agent": "-", "expert": (0, (4, 1.6))}
 AIM: dict[str, Any] = {"color": SET_POINT, "linestyle": (0, (1, 1.2))}
-KIND_STYLES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.2, 1, 1.2)))
+KIND_STYLES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.2, 1, 1.2)), (0, (6, 1, 1, 1, 1, 1)))
 BAND_OPACITY = 0.2
 BAND = "mean ± standard deviation"
 SINGLE = "single seeds"
@@ -109,18 +109,13 @@ def control_figure(
     grid = figure.add_gridspec(len(heights), n_loops, height_ratios=heights)
     for loop, (output, entry, target) in enumerate(zip(controlled, manipulated, set_point, strict=True)):
         axes = figure.add_subplot(grid[0, loop])
-        _draw_response(axes, response, output, target)
-        _finish(axes, ascii_uppercase[loop], output, words)
+        _draw_response(axes, response, output, words, ascii_uppercase[loop], target)
+        axes.set_xlabel("")
         axes.tick_params(labelbottom=False)
-        below = figure.add_subplot(grid[1, loop], sharex=axes)
-        _draw_response(below, response, entry)
-        _finish(below, "", entry, words)
-        below.set_xlabel(TIME_LABEL)
+        _draw_response(figure.add_subplot(grid[1, loop], sharex=axes), response, entry, words)
         if zoom_from is not None:
             zoom = figure.add_subplot(grid[2, loop])
-            _draw_response(zoom, response[response["time_index"] >= zoom_from], output, target, with_band=False)
-            _finish(zoom, ascii_uppercase[n_loops + loop], output, words, zoom_from)
-            zoom.set_xlabel(TIME_LABEL)
+            _draw_response(zoom, response, output, words, ascii_uppercase[n_loops + loop], target, zoom_from)
     figure.align_ylabels()
     _legend(figure, response, ("controlled", "manipulated"), agent_label, r"PID $\pi^E$")
     return figure
@@ -139,9 +134,7 @@ def tracking_figure(
     early = response[response["time_index"] <= FIRST]
     for loop, (output, target) in enumerate(zip(controlled, set_point, strict=True)):
         axes = figure.add_subplot(1, len(controlled), loop + 1)
-        _draw_response(axes, early, output, target)
-        _finish(axes, ascii_uppercase[loop], output, descriptions or {})
-        axes.set_xlabel(TIME_LABEL)
+        _draw_response(axes, early, output, descriptions or {}, ascii_uppercase[loop], target)
     _legend(figure, response, ("controlled",), agent_label, expert_label)
     return figure
 
@@ -159,55 +152,49 @@ def learning_curves(
         marks: epochs worth a vertical line, and why.
         return_levels, gap_levels: horizontal lines by label, such as the expert's return or the paper's gap.
     """
-    weights = [column for column in history if column.startswith("alpha:")]
-    panels: dict[str, tuple[list[str], str, Mapping[str, float]]] = {  # columns, label of the axis, horizontal lines
-        "mean return": (["mean_return"], "discounted return (no unit)", return_levels or {})
-    }
+    names = [column.removeprefix("alpha:") for column in history if column.startswith("alpha:")]
+    panels = {"Mean return": ("discounted return (no unit)", return_levels or {})}  # label of the axis, horizontal lines
     if "feature_gap" in history and history["feature_gap"].notna().any():
-        panels["feature gap"] = (["feature_gap"], "gap to the expert (%, log scale)", gap_levels or {})
-    if weights:
-        panels["reward weights"] = (weights, "weight (no unit)", {})
+        panels["Feature gap"] = ("gap to the expert (%, log scale)", gap_levels or {})
+    if names:
+        panels["Reward weights"] = ("weight (no unit)", {})
     figure = empty_figure(max(6.0, WIDTH / 3 * len(panels)), 4.0)
-    epochs, n_seeds = history["epochs"], _n_seeds(history)
+    epochs = history["epochs"]
     points: Any = {"marker": "o" if epochs.nunique() <= FEW_POINTS else "", "markersize": 3}
-    for index, (panel, (columns, unit, levels)) in enumerate(panels.items()):
+    for index, (panel, (unit, levels)) in enumerate(panels.items()):
         axes = figure.add_subplot(1, len(panels), index + 1)
-        of_weights = columns is weights
-        styles = feature_styles([column.removeprefix("alpha:") for column in weights]) if of_weights else {panel: {"color": INK}}
+        letter, of_weights = ascii_uppercase[index], panel == "Reward weights"
+        columns = [f"alpha:{name}" for name in names] if of_weights else [panel.lower().replace(" ", "_")]
+        styles = feature_styles(names) if of_weights else {panel.lower(): {"color": INK}}
         for column, (label, style) in zip(columns, styles.items(), strict=True):
             _draw_runs(axes, history, "epochs", column, label=label, **style, **points)
-        axes.set_ylabel(unit)
-        if panel == "feature gap":
+        if panel == "Feature gap":
             axes.set_yscale("log")
-            axes.yaxis.set_major_formatter(FuncFormatter(_percent))
-            axes.yaxis.set_minor_formatter(FuncFormatter(_percent_of_few))
-        listed: list[Line2D] = [*axes.lines] if of_weights else []
-        if panel == "mean return":
-            listed += _seed_handles(n_seeds)
+            axes.yaxis.set_major_formatter(lambda share, _: f"{100 * share:.3g}")
+            axes.yaxis.set_minor_formatter(lambda share, _: f"{100 * share:.3g}" if f"{share:.0e}"[0] in "25" else "")
+        listed = [*axes.lines] if of_weights else _seed_handles(_n_seeds(history)) if panel == "Mean return" else []
         listed += _draw_levels(axes, epochs, levels)
         for (epoch, name), style in zip((marks or {}).items(), cycle(KIND_STYLES[2:]), strict=False):
             mark = axes.axvline(epoch, color=MUTED, linestyle=style, linewidth=1.2, label=name)
             listed += [] if of_weights else [mark]  # the other panels explain it
         if listed:
-            n_columns = len({name.rpartition("-")[2] for name in weights}) if of_weights else 1
+            n_columns = len({name.rpartition("-")[2] for name in names}) if of_weights else 1
             place: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.19), "frameon": False}
             legend = axes.legend(handles=listed, ncols=n_columns, columnspacing=1.0, handlelength=2.0, **place)
             for line in legend.get_lines():
                 line.set_marker("")  # it would hide the dashes
-        title = panel[:1].upper() + panel[1:] + (r" $\alpha$" if of_weights else "")
-        head(axes, ascii_uppercase[index] if len(panels) > 1 else "", title, f"{ascii_uppercase[index]} {panel}")
-        axes.set_xlabel("epoch")
+        title = rf"{panel} $\alpha$" if of_weights else panel
+        head(axes, letter if len(panels) > 1 else "", title, f"{letter} {panel.lower()}", xlabel="epoch", ylabel=unit)
         axes.xaxis.set_major_locator(MaxNLocator(5, integer=True, steps=[1, 2, 5, 10]))
     return figure
 
 
-def budget_figure(frame: pd.DataFrame, references: Mapping[int, Mapping[str, float]], titles: Mapping[int, str]) -> Figure:
+def budget_figure(frame: pd.DataFrame, references: Mapping[int, Mapping[str, float]]) -> Figure:
     """The objective after online learning against the plant episodes that each epoch was given, a panel for each case.
 
     Args:
         frame: columns seed, case, episodes_per_epoch, objective.
         references: by case, objectives to compare with, by label: horizontal lines.
-        titles: by case.
     """
     cases = sorted(frame["case"].unique())
     figure = empty_figure(max(6.0, WIDTH / 3 * len(cases)), 3.8)
@@ -217,12 +204,10 @@ def budget_figure(frame: pd.DataFrame, references: Mapping[int, Mapping[str, flo
         _draw_runs(axes, rows, "episodes_per_epoch", "objective", **look)
         episodes = np.sort(rows["episodes_per_epoch"].unique())
         _draw_levels(axes, episodes, references[case], linewidth=1.2)
-        axes.set_xscale("log")
+        words = {"xlabel": "plant episodes per epoch (log)", "ylabel": "tracking objective $J$ (no unit)"}
+        head(axes, letter, case_study(case), f"{letter} case {case}", xscale="log", **words)
         axes.set_xticks(episodes, [f"{number:g}" for number in episodes])
         axes.xaxis.set_minor_locator(NullLocator())
-        axes.set_xlabel("plant episodes per epoch (log)")
-        axes.set_ylabel("tracking objective $J$ (no unit)")
-        head(axes, letter, titles[case], f"{letter} case {case}")
     handles = [*figure.axes[0].lines, *_seed_handles(_n_seeds(frame))[:1]]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return figure
@@ -235,10 +220,10 @@ def _draw_levels(axes: Axes, x: Any, levels: Mapping[str, float], **style: Any) 
     return [line for (line,) in lines]
 
 
-def head(axes: Axes, letter: str, title: str, name: str) -> None:
-    """The title of a panel, after its letter if it has one, and the name by which `drawn_summary` lists it."""
+def head(axes: Axes, letter: str, title: str, name: str, **others: Any) -> None:
+    """The title of a panel, after its letter if any, the name by which `drawn_summary` lists it, and what else `Axes.set` takes."""
     axes.set_title(f"$\\mathbf{{{letter}}}$  {title}" if letter else title, loc="left")
-    axes.set_label(name)
+    axes.set(label=name, **others)
 
 
 def feature_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -297,35 +282,45 @@ def lay_out(figure: Figure) -> None:
 
 
 def _draw_response(
-    axes: Axes, response: pd.DataFrame, variable: str, set_point: float | None = None, with_band: bool = True
+    axes: Axes,
+    response: pd.DataFrame,
+    variable: str,
+    words: Mapping[str, str],
+    letter: str = "",
+    set_point: float | None = None,
+    zoom_from: int | None = None,
 ) -> None:
-    """Mean and band of one variable under expert and agent; an input is drawn as held until the next sample.
+    """Mean and band of one variable under expert and agent, in a zoom without the band; an input is held until the next sample.
 
     Of several runs the medians of mean and standard deviation at each sample, and the mean of each run as a thin line.
     """
+    response = response if zoom_from is None else response[response["time_index"] >= zoom_from]
     for controller in ("expert", "agent"):
         rows = response[(response["controller"] == controller) & (response["variable"] == variable)]
         if rows.empty:
             raise ValueError(f"response table: expected rows of controller '{controller}' and variable '{variable}', found none")
         kind = rows["kind"].iloc[0]
-        held: Any = {}
-        if kind == "manipulated":
+        colour, label, held = COLOURS[kind, controller], f"{kind}, {controller}", kind == "manipulated"
+        if held:
             last = rows["time_index"].max()
             rows = pd.concat([rows, rows[rows["time_index"] == last].assign(time_index=last + 1)])
-            held = {"step": "post"}
-        colour, label = COLOURS[kind, controller], f"{kind}, {controller}"
-        _draw_singles(axes, rows, "time_index", "mean", colour, held=bool(held))
-        middle = rows.groupby("time_index")[["mean", "std"]].median()
-        time, mean, std = middle.index.to_numpy(), middle["mean"].to_numpy(), middle["std"].to_numpy()
-        if with_band:
-            look: Any = {"color": colour, "alpha": BAND_OPACITY, "linewidth": 0, "label": f"{label}: {BAND}"}
-            axes.fill_between(time, mean - std, mean + std, **look, **held)
-        steps = "steps-post" if held else "default"
-        axes.plot(time, mean, color=colour, linestyle=LINE_STYLES[controller], drawstyle=steps, label=label)
+        style: Any = {"linestyle": LINE_STYLES[controller], "drawstyle": "steps-post" if held else "default"}
+        _draw_runs(axes, rows, "time_index", "mean", color=colour, label=label, **style)
+        if zoom_from is None:
+            middle = rows.groupby("time_index")[["mean", "std"]].median()
+            low, high = middle["mean"] - middle["std"], middle["mean"] + middle["std"]
+            band: Any = {"alpha": BAND_OPACITY, "linewidth": 0, "step": "post" if held else None}
+            axes.fill_between(middle.index, low, high, color=colour, label=f"{label}: {BAND}", **band)
     limits = [response["time_index"].min(), response["time_index"].max()]
     if set_point is not None:
         axes.plot(limits, [set_point, set_point], linewidth=2, label="set point", **AIM)
-    axes.set_xlim(*limits)
+    title = f"{capital(words.get(variable, ''))} {symbol(variable)}".strip()
+    if zoom_from is not None:
+        title = f"Zoom of {symbol(variable)} from sample {zoom_from}"
+    name = " ".join(part for part in (letter, variable, "" if zoom_from is None else "zoom") if part)
+    unit = f"{symbol(variable)} ({DEVIATION})".replace(", ", ",\n")
+    head(axes, letter, title, name, xlim=limits, xlabel=TIME_LABEL, ylabel=unit)
+    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True, steps=[1, 2, 5, 10]))
 
 
 def _n_seeds(frame: pd.DataFrame) -> int:
@@ -333,25 +328,16 @@ def _n_seeds(frame: pd.DataFrame) -> int:
 
 
 def _draw_runs(axes: Axes, frame: pd.DataFrame, x: str, y: str, **style: Any) -> None:
-    """The median over the runs at every x, and each run as a thin line where there are several."""
-    _draw_singles(axes, frame, x, y, style["color"])
+    """The median over the runs at every x, and each run as a thin line where there are several; the fainter, the more they are."""
+    if (n_seeds := _n_seeds(frame)) > 1:
+        lines = [run[[x, y]].to_numpy(dtype=float) for _, run in frame.sort_values(x).groupby("seed")]
+        if style.get("drawstyle") == "steps-post":
+            lines = [np.column_stack([run[:, 0].repeat(2)[1:], run[:, 1].repeat(2)[:-1]]) for run in lines]
+        thin: Any = {"linewidth": THIN, "alpha": max(0.4, 1 / n_seeds**0.5), "rasterized": len(frame) > MANY_POINTS}
+        pale = (np.array(to_rgb(style["color"])) + 1) / 2  # many of them on one another stay lighter than the median
+        axes.add_collection(LineCollection(lines, label=SINGLE, color=pale, **thin))
     middle = frame.groupby(x)[y].median()
     axes.plot(middle.index, middle, **style)
-
-
-def _draw_singles(axes: Axes, frame: pd.DataFrame, x: str, y: str, colour: str, held: bool = False) -> None:
-    """Each of several runs as a thin line, with steps where a value is `held` until the next x; the fainter, the more they are."""
-    n_seeds = _n_seeds(frame)
-    if n_seeds < 2:
-        return
-    lines = []
-    for _, run in frame.sort_values(x).groupby("seed"):
-        points = run[[x, y]].to_numpy(dtype=float)
-        lines.append(np.column_stack([points[:, 0].repeat(2)[1:], points[:, 1].repeat(2)[:-1]]) if held else points)
-    thin: Any = {"linewidth": THIN, "alpha": max(0.4, 1 / n_seeds**0.5), "rasterized": len(frame) > MANY_POINTS}
-    pale = (np.array(to_rgb(colour)) + 1) / 2  # many of them on one another stay lighter than the median
-    axes.add_collection(LineCollection(lines, label=SINGLE, color=pale, **thin))
-    axes.autoscale_view()
 
 
 def _seed_handles(n_seeds: int) -> list[Line2D]:
@@ -360,17 +346,6 @@ def _seed_handles(n_seeds: int) -> list[Line2D]:
         return []
     thin = Line2D([], [], color=INK, linewidth=THIN, label=f"thin: each of {n_seeds} seeds")
     return [thin, Line2D([], [], color=INK, label="thick: their median")]
-
-
-def _finish(axes: Axes, letter: str, variable: str, descriptions: Mapping[str, str], zoom_from: int | None = None) -> None:
-    """Title, label and unit of a panel; the letter of a panel stands on its first axes only."""
-    words = descriptions.get(variable, "")
-    title = f"{words[:1].upper()}{words[1:]} {symbol(variable)}".strip()
-    if zoom_from is not None:
-        title = f"Zoom of {symbol(variable)} from sample {zoom_from}"
-    head(axes, letter, title, " ".join(part for part in (letter, variable, "" if zoom_from is None else "zoom") if part))
-    axes.set_ylabel(f"{symbol(variable)} ({DEVIATION})".replace(", ", ",\n"))
-    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True, steps=[1, 2, 5, 10]))
 
 
 def _legend(figure: Figure, response: pd.DataFrame, kinds: Sequence[str], agent_label: str, expert_label: str) -> None:
@@ -390,12 +365,3 @@ def _legend(figure: Figure, response: pd.DataFrame, kinds: Sequence[str], agent_
     handles = [*handles[:2], *below, *handles[2:], band]
     narrow: Any = {"fontsize": 8, "labelspacing": 0.2} if figure.get_figwidth() < WIDTH else {}
     figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False, **narrow)
-
-
-def _percent(share: float, position: int | None = None) -> str:
-    return f"{100 * share:.3g}"
-
-
-def _percent_of_few(share: float, position: int | None = None) -> str:
-    """Labels of the minor ticks of a decade: only those at 2 and 5 times a power of ten."""
-    return _percent(share) if f"{share:.0e}"[0] in "25" else ""

@@ -41,11 +41,7 @@ def environment() -> Environment:
 
 
 def render(template: str, folder: Path, **values: Any) -> str:
-    """A template as Markdown, its figures, tables and equations numbered.
-
-    Args:
-        folder: where the report is to stand, for links to the project's files.
-    """
+    """A template as Markdown, its figures, tables and equations numbered; links to the project's files lead from `folder`."""
 
     def link(words: str, place: str) -> str:
         return f"[{words}]({Path(os.path.relpath(PROJECT / place, folder)).as_posix()})"

@@ -11,9 +11,8 @@ WITH_MODEL = ("one_policy", "mpc", "minimum_variance", "minimum_variance_filtere
 def answer(found: pd.DataFrame, budget: pd.DataFrame) -> str:
     """Who learns best from how many plant episodes, and what those reach that have the exact model instead.
 
-    Args:
-        found: columns objective and gap (per cent below the programme), index controller.
-        budget: the objective of each learner (index) after so many episodes (columns), and of those that spend none; fewer draws.
+    `found` has the columns objective and gap (per cent below the programme), index controller; `budget` the objective of each
+    learner (index) after so many episodes (columns), and of those that spend none, from fewer draws.
     """
     learners = budget.drop(index=[name for name in NO_LEARNERS if name in budget.index])
     lines = []

@@ -76,20 +76,15 @@ def notes(workshop: Workshop) -> dict[str, object]:
 
 
 def export_policy(workshop: Workshop, policy: TrackingPolicy, folder: Path) -> float:
-    """Write policy.onnx, the same with batch 1 and fixed shapes, and as C source; the greatest disagreement with torch.
+    """Write policy.onnx, the same with batch 1 and fixed shapes, and as C source.
 
-    Returns:
-        Over whole episodes, as a share of the input range.
-
-    Raises:
-        InputError: if file and policy disagree.
+    Returns the greatest disagreement with torch over whole episodes, as a share of the input range; InputError if they disagree.
     """
     description = workshop.plant.description
     steady = description.steady("controlled"), description.steady("manipulated")
     paths = [folder / name for name in NAMES[:3]]
-    for path, static in zip(paths, (False, True), strict=False):
-        export(policy, *steady, path, notes(workshop), static)
-    export_c(paths[1], paths[2])
+    export(policy, *steady, paths[0], notes(workshop))
+    export_c(export(policy, *steady, paths[1], notes(workshop), static=True), paths[2])
     scenarios = workshop.draw(workshop.held_out, 20, workshop.plant.stream("export"))
     with torch.no_grad():
         run = track(policy, scenarios, workshop.operation.bounds)
@@ -107,9 +102,8 @@ def offline(plant: OwnPlant, workshop: Workshop) -> tuple[dict[str, pd.DataFrame
         study, found = learn_offline(plant, model, task_on(plant, model))
     except (InputError, TrainingError) as error:
         return {}, [f"the weights of the record's controller were not found: {error}"]
-    told = [
-        f"{shown.trajectories.n_trajectories} episodes of {plant.description.horizon} samples show what the record's PID is after"
-    ]
+    total, horizon = shown.trajectories.n_trajectories, plant.description.horizon
+    told = [f"{total} episodes of {horizon} samples show what the record's PID is after"]
     told += [f"left out: {number} episodes ({reason})" for reason, number in shown.left_out.items() if number]
     if (gap := min(record.feature_gap for record in found.records)) > MEANINGLESS:
         why = "a feature of the record is next to zero, its variable is far from its set point"

@@ -120,10 +120,8 @@ def _shown(name: str, card: Mapping[str, Any]) -> str:
         key: ", ".join(f"{variable} {low:g}" + (f" to {high:g}" if high > low else "") for variable, (low, high) in found.items())
         for key, found in (("set_points", card["set_point_range"]), ("inputs", card["input_range"]))
     }
-    words["scores"] = "; ".join(
-        f"Case {ROMAN[int(case) - 1]}, " + ", ".join(f"{who} {value:.2f}" for who, value in found.items())
-        for case, found in card["scores"].items()
-    )
+    scores = {case: ", ".join(f"{who} {value:.2f}" for who, value in found.items()) for case, found in card["scores"].items()}
+    words["scores"] = "; ".join(f"Case {ROMAN[int(case) - 1]}, {said}" for case, said in scores.items())
     return CARD.format(**dict(card) | words, name=name)
 
 

@@ -192,9 +192,7 @@ def learning_curves(
 def budget_figure(frame: pd.DataFrame, references: Mapping[int, Mapping[str, float]]) -> Figure:
     """The objective after online learning against the plant episodes that each epoch was given, a panel for each case.
 
-    Args:
-        frame: columns seed, case, episodes_per_epoch, objective.
-        references: by case, objectives to compare with, by label: horizontal lines.
+    `frame` has the columns seed, case, episodes_per_epoch, objective; `references` are horizontal lines by case and label.
     """
     cases = sorted(frame["case"].unique())
     figure = empty_figure(max(6.0, WIDTH / 3 * len(cases)), 3.8)
@@ -228,13 +226,11 @@ def head(axes: Axes, letter: str, title: str, name: str, **others: Any) -> None:
 
 def feature_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """A line style for each feature, by its label: one colour a loop, one dash pattern a kind."""
-    parts = [name.rpartition("-") for name in names]
-    colours = dict(zip(dict.fromkeys(loop for loop, _, _ in parts), cycle(LOOP_COLOURS), strict=False))
-    dashes = dict(zip(dict.fromkeys(kind for _, _, kind in parts), cycle(KIND_STYLES), strict=False))
-    return {
-        feature_symbol(name): {"color": colours[loop], "linestyle": dashes[kind]}
-        for name, (loop, _, kind) in zip(names, parts, strict=True)
-    }
+    loops, _, kinds = zip(*(name.rpartition("-") for name in names), strict=True)
+    colours = dict(zip(dict.fromkeys(loops), cycle(LOOP_COLOURS), strict=False))
+    dashes = dict(zip(dict.fromkeys(kinds), cycle(KIND_STYLES), strict=False))
+    places = zip(names, loops, kinds, strict=True)
+    return {feature_symbol(name): {"color": colours[loop], "linestyle": dashes[kind]} for name, loop, kind in places}
 
 
 def drawn_summary(figure: Figure) -> pd.DataFrame:
@@ -355,11 +351,10 @@ def _legend(figure: Figure, response: pd.DataFrame, kinds: Sequence[str], agent_
         for kind in kinds
         for controller, label in (("agent", agent_label), ("expert", expert_label))
     ]
-    n_seeds = _n_seeds(response)
-    over = f", medians over {n_seeds} seeds" if n_seeds > 1 else ""
-    below = [Line2D([], [], linewidth=2, label="set point", **AIM)]
-    if n_seeds > 1:
+    below, over = [Line2D([], [], linewidth=2, label="set point", **AIM)], ""
+    if (n_seeds := _n_seeds(response)) > 1:
         below.append(Line2D([], [], color=INK, linewidth=THIN, label="thin lines: the mean of each seed"))
+        over = f", medians over {n_seeds} seeds"
     band = Patch(facecolor="#888888", alpha=0.35, label=f"line and band: {BAND}{over}")
     # A legend fills column by column: one for the outputs, one for the inputs, where there are both.
     handles = [*handles[:2], *below, *handles[2:], band]

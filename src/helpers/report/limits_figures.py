@@ -47,7 +47,6 @@ RIVALS = ("clone_reinforce", "csil_reinforce", "scratch_reinforce", "ppo", "recu
 LEARNERS = (THE_PAPERS, "irl_alone", *RIVALS)  # the rivals need no model
 LEVELS = ("one_policy", "mpc", "minimum_variance", "expert", "dynamic_programme")
 RUNS = {"hot": "hot start", "cloned": "from the clone", "scratch": "from scratch"}
-NOTHING = "#c8c8c8"  # under a condition in which no controller earns anything
 GRIDS = {  # of each group of conditions: title, label of the rows, label of the columns
     "model": ("mismatch of the model", "A, times", "B, times"),
     "noise": ("disturbance and observation noise", "disturbance, times", "observation noise, times"),
@@ -57,10 +56,7 @@ GRIDS = {  # of each group of conditions: title, label of the rows, label of the
 
 
 def gap_figure(gaps: pd.DataFrame) -> Figure:
-    """The gap of every controller to the dynamic programme with its 95 % interval; a panel for each case.
-
-    `gaps` has the columns case, controller, gap, gap_low, gap_high, in per cent.
-    """
+    """Gaps to the dynamic programme (columns case, controller, gap, gap_low, gap_high, in per cent); a panel for each case."""
     listed = [name for name in LABELS if name in set(gaps["controller"])][::-1]
     figure = empty_figure(WIDTH, 0.6 + 0.27 * len(listed))
     panels = np.atleast_1d(figure.subplots(1, gaps["case"].nunique(), sharey=True))
@@ -75,12 +71,10 @@ def gap_figure(gaps: pd.DataFrame) -> Figure:
 
 
 def budget_curves(curves: pd.DataFrame, levels: Mapping[str, float]) -> Figure:
-    """The objective against the plant episodes spent, a line for each learner, beside those that do not learn.
+    """The objective against the plant episodes spent, a line for each learner, beside the `levels` of those that do not learn.
 
-    Args:
-        curves: columns learner, episodes, objective, and seed where there are several; the line is then the median and the band
-            around it holds the middle half of the seeds.
-        levels: objectives of controllers that do not learn.
+    `curves` has the columns learner, episodes, objective, and seed where there are several; the line is then the median and the
+    band around it holds the middle half of the seeds.
     """
     figure = empty_figure(WIDTH, 4.4)
     _draw_budget(figure.add_subplot(label="budget"), curves, levels)
@@ -136,7 +130,7 @@ def heat_maps(robustness: pd.DataFrame, group: str, controllers: Sequence[str]) 
         values = table.loc[name].loc[rows, columns]
         look: Any = {"cmap": colours, "norm": norm, "cbar": False, "annot_kws": {"fontsize": 7.5}}
         heatmap(100 * (values - reference) / best, annot=values, fmt=".1f", ax=axes, **look)
-        axes.set(xlabel="", ylabel="", facecolor=NOTHING, label=f"{name} {group}")
+        axes.set(xlabel="", ylabel="", facecolor="#c8c8c8", label=f"{name} {group}")  # grey, where no controller earns anything
         axes.tick_params(labelbottom=index >= len(controllers) - across, labelleft=index % across == 0, labelrotation=0)
         axes.set_title(LABELS[name], fontsize=9, loc="left")
     figure.supxlabel(column_label, fontsize=10)
@@ -148,10 +142,7 @@ def heat_maps(robustness: pd.DataFrame, group: str, controllers: Sequence[str]) 
 
 
 def robustness_figure(shares: pd.DataFrame, groups: Mapping[str, str]) -> Figure:
-    """The least share of the PID's objective over each grid of conditions: a panel for each case, a row for each controller.
-
-    `shares` are those of `limits_report.worst`, `groups` are words for the grids.
-    """
+    """The shares of `limits_report.worst`, a panel for each case, a row for each controller; `groups` are words for the grids."""
     names = [name for name in LABELS if name in set(shares["controller"])]
     heights = pd.Series(range(0, -len(names), -1), names)
     figure = empty_figure(WIDTH, 1.2 + 0.24 * len(names))

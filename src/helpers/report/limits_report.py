@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 from helpers.report import limits_figures, scorecard
 from helpers.report.collection import Results, stacked
 from helpers.report.limits_figures import GRIDS, LABELS, RIVALS, RUNS, THE_PAPERS
-from helpers.report.tables import NOT_KNOWN, ROMAN, spread, symbol
+from helpers.report.tables import NOT_KNOWN, ROMAN, capital, spread, symbol
 from helpers.settings.paper import Params
 
 PLACES = 4  # digits after the point that count
@@ -98,7 +98,7 @@ def without_the_plant(results: Results) -> dict[str, pd.DataFrame]:
         figures, place = ["mean |e|", "movement"], ["seed", "controller"]
         means = results.own_plant.groupby(place, sort=False)[figures].mean()
         shares = (100 * means / means.xs("PID of the record", level="controller")).groupby("controller", sort=False).median()
-        table = shares.map("{:.0f}".format).rename(columns=lambda name: f"{name[:1].upper()}{name[1:]}, % of the record's PID")
+        table = shares.map("{:.0f}".format).rename(columns=lambda name: f"{capital(name)}, % of the record's PID")
         offsets = results.own_plant.groupby(place, sort=False)["offset"].max().groupby("controller", sort=False).median()
         found["own_plant"] = table.assign(**{"Greatest offset, % of the range": (100 * offsets).map("{:.1f}".format)}).reset_index()
     return found
@@ -272,5 +272,5 @@ def draw(results: Results) -> dict[str, Figure]:
 def heat_map_names(results: Results) -> list[str]:
     """The heat maps that there are, by grid and case."""
     robust = read(results, "robustness", "robustness.csv").reindex(columns=["case", "group"])
-    found = robust.drop_duplicates().astype({"case": int}).itertuples(index=False, name=None)
-    return [f"limits_{group}_case_{case}" for case, group in sorted(found, key=lambda place: (place[0], [*GRIDS].index(place[1])))]
+    found = set(robust.itertuples(index=False, name=None))
+    return [f"limits_{group}_case_{case}" for case in results.params for group in GRIDS if (case, group) in found]

@@ -38,6 +38,7 @@ from helpers.own_plant.online import improve_on_plant
 from helpers.plant.tracking import track
 from helpers.report.figures import DPI_FILE
 from helpers.report.plant_figures import gate_figure, loops_figure, progress_figure, quality_figure, validation_figure
+from helpers.report.tables import capital
 from helpers.runs.request import check_place
 from helpers.runs.scratch import beside, sweep
 from helpers.runs.sources import PROJECT
@@ -179,7 +180,7 @@ def run(path: Path, output: Path, params_root: Path, scale: str, seed: int) -> O
 def write(outcome: Outcome, title: str, output: Path) -> None:
     """report.md with its figures beside it; the first line is the verdict."""
     verdict, *others = outcome.sentences
-    parts = [f"**{verdict[:1].upper()}{verdict[1:]}.**", "", f"# {title}", "", *(f"- {sentence}" for sentence in others)]
+    parts = [f"**{capital(verdict)}.**", "", f"# {title}", "", *(f"- {sentence}" for sentence in others)]
     for name, table in outcome.tables.items():
         parts += ["", f"## {name}", "", table.to_markdown(floatfmt=".4g", index=name != "Data quality")]
     for name, figure in outcome.figures.items():

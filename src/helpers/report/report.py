@@ -29,7 +29,7 @@ from helpers.runs.opening import parameters_hash
 from helpers.runs.pictures import smaller
 from helpers.runs.scratch import beside, sweep
 from helpers.runs.sources import PROJECT
-from helpers.settings.paper import OnlineParams, Params
+from helpers.settings.paper import Params
 
 RUNNERS = ("papermill", "snakemake", "pypandoc_binary", "typst")  # packages that shape no number
 SHOWN_AS_PIXELS = ("figure_3", "comparison")  # in README and report.md, where a reader without a browser of its own meets them
@@ -73,8 +73,10 @@ def draw(results: Results, compared: pd.DataFrame) -> dict[str, Figure]:
         papers, unweighted = {"the paper's own gap": results.published[case].feature_gap}, history.filter(regex="^(?!alpha:)")
         drawn[f"learning_curves_case_{case}"] = figures.learning_curves(unweighted, marks=marks, gap_levels=papers)
         drawn[f"weights_{case}"] = verdict_figures.weights_figure(history, compared[compared["case"] == case])
-        history = results.table(case, ONLINE, "history.csv")
-        marks = _rounds(params.case.online, history["epochs"].nunique())
+        history, online = results.table(case, ONLINE, "history.csv"), params.case.online
+        n_epochs = history["epochs"].nunique()  # at smoke scale fewer than the parameters say; the rounds shrink alike
+        ends = [round(n_epochs * end / sum(online.epochs)) for end in itertools.accumulate(online.epochs[:-1])]
+        marks = {end: f"next round, β = {beta:g}" for end, beta in zip(ends, online.beta[1:], strict=True)}
         drawn[f"online_curves_case_{case}"] = figures.learning_curves(history, marks=marks, return_levels=levels[case])
     if len(results.budget):
         drawn["online_budget"] = figures.budget_figure(results.budget, levels)
@@ -89,15 +91,6 @@ def draw(results: Results, compared: pd.DataFrame) -> dict[str, Figure]:
         drawn["inferred_profiles"] = verdict_figures.profiles_figure(*found)
     drawn |= limits_report.draw(results)
     return {f"figure_{OF_THE_PAPER[name]}" if name in OF_THE_PAPER else name: figure for name, figure in drawn.items()}
-
-
-def _rounds(online: OnlineParams, n_epochs: int) -> dict[int, str]:
-    """The last epoch before each later round of online learning, and that round's beta, to mark on a curve.
-
-    At smoke scale a run has fewer epochs than the parameters say; its rounds shrink alike.
-    """
-    ends = [round(n_epochs * end / sum(online.epochs)) for end in itertools.accumulate(online.epochs[:-1])]
-    return {end: f"next round, β = {beta:g}" for end, beta in zip(ends, online.beta[1:], strict=True)}
 
 
 def tabulate(results: Results) -> dict[str, pd.DataFrame]:

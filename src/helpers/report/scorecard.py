@@ -141,10 +141,8 @@ def comparison(
                 ours = found.reindex([key]).iloc[0]
                 n_seeds, lacking = int(np.nan_to_num(ours["n_seeds"])), 0.0
                 if n_seeds and metric == "v":
-                    if error := (sampling_errors or {}).get((case, feature)):
-                        variance = PUBLISHED_TRAJECTORIES * error**2
-                    else:
-                        variance = float(np.mean(runs[case, stage, f"v:{feature}:std"] ** 2))
+                    error = (sampling_errors or {}).get((case, feature))
+                    variance = PUBLISHED_TRAJECTORIES * error**2 if error else np.mean(runs[case, stage, f"v:{feature}:std"] ** 2)
                     lacking = variance * max(0.0, 1 / PUBLISHED_TRAJECTORIES - 1 / trajectories[row])
                 low, high = prediction_interval(runs.get(key, ()), lacking)
                 numbers = [ours["median"], n_seeds, ours["ci_low"], ours["ci_high"], low, high]

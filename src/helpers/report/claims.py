@@ -35,11 +35,7 @@ class Quantity(Record):
 
 
 class Claim(Record):
-    """One checkable sentence of the paper, and what decides about it.
-
-    Attributes:
-        changed: when and why the test was changed after results were known.
-    """
+    """One checkable sentence of the paper, and what decides about it."""
 
     section: Text
     statement: Text
@@ -48,7 +44,7 @@ class Claim(Record):
     margin: Real | None = None
     why: Text
     quantities: dict[Text, Quantity] = Field(default_factory=dict)
-    changed: Dated | None = None
+    changed: Dated | None = None  # when and why the test was changed after results were known
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -97,10 +93,7 @@ class Verdict(NamedTuple):
 
 
 def judge(claim: Claim, values: pd.DataFrame) -> Verdict:
-    """The verdict on one quantity of a claim in one case.
-
-    `values` has a row for each seed, with the columns `value` and, where the test compares two, `against`.
-    """
+    """The verdict on one quantity of a claim, from a row a seed: the columns `value` and, where two are compared, `against`."""
     kind, _, side = claim.test.partition("_")
     if claim.test in WITHOUT_RUNS:
         return Verdict(WITHOUT_RUNS[claim.test], claim.why)

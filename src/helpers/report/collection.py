@@ -27,44 +27,30 @@ MADE_BY = {"demonstrations": "01", "offline": "02", "online": "03 (04 for the tr
 
 @dataclass(frozen=True)
 class Results:
-    """What the stages of all cases and seeds wrote.
+    """What the stages of all cases and seeds wrote; a table is empty where it was not run.
 
-    Attributes:
-        params, published: by case.
-        stages: by case, seed and folder name.
-        seeds: columns case, seed, stage, metric, value. The stages: expert; minimum_variance; offline, online and online_y of
-            the headline variant (offline of a transfer case is after the transfer); offline_printed; offline_scratch (the
-            transfer case learned from nothing). The ratios of `scorecard.relative` are among the rows.
-        made_from: `identity.inputs` of the report itself.
-        missing: of the seeds asked for, those of which a stage is missing, where that is allowed.
-        claims: columns `claims.COLUMNS`; claim_values: the numbers behind them, of `claims.collect`; budget: seed, case,
-            episodes_per_epoch, objective; trials: trial, family, description, case, seed, gap. Each is empty where it was not run.
-        inferred: what notebook 00 wrote, if it was run.
-        limits: by case, seed and part of notebook 06, where it was run to its end.
-        one_policy, own_plant: summary.csv of notebook 09 and scores.csv of notebook 07 with a column seed; empty where not run.
-        search: what `make search` wrote, if it was run.
-        beyond: every stage beyond the paper's own runs, those of claims, budget, trials, limits and inferred settings.
-        left_out: of these runs the notebooks of which a result is there, but made from other inputs than there are now.
+    The stages in `seeds`: expert; minimum_variance; offline, online and online_y of the headline variant (offline of a transfer
+    case is after the transfer); offline_printed; offline_scratch (the transfer case learned from nothing).
     """
 
     scale: str
-    params: dict[int, Params]
-    published: dict[int, PublishedCase]
-    stages: dict[tuple[int, int, str], Stage]
-    seeds: pd.DataFrame
-    claims: pd.DataFrame
-    claim_values: pd.DataFrame
-    budget: pd.DataFrame
-    trials: pd.DataFrame
-    inferred: Stage | None
-    limits: Mapping[tuple[int, int, str], Stage]
-    one_policy: pd.DataFrame
-    own_plant: pd.DataFrame
-    search: Stage | None
-    beyond: tuple[Stage, ...]
-    made_from: Mapping[str, str]
-    missing: tuple[int, ...]
-    left_out: tuple[str, ...]
+    params: dict[int, Params]  # by case
+    published: dict[int, PublishedCase]  # by case
+    stages: dict[tuple[int, int, str], Stage]  # by case, seed and folder name
+    seeds: pd.DataFrame  # columns case, seed, stage, metric, value; with the ratios of `scorecard.relative`
+    claims: pd.DataFrame  # columns `claims.COLUMNS`
+    claim_values: pd.DataFrame  # the numbers behind the claims, of `claims.collect`
+    budget: pd.DataFrame  # columns seed, case, episodes_per_epoch, objective
+    trials: pd.DataFrame  # columns trial, family, description, case, seed, gap
+    inferred: Stage | None  # what notebook 00 wrote, if it was run
+    limits: Mapping[tuple[int, int, str], Stage]  # by case, seed and part of notebook 06, where it was run to its end
+    one_policy: pd.DataFrame  # summary.csv of notebook 09 with a column seed
+    own_plant: pd.DataFrame  # scores.csv of notebook 07 with a column seed
+    search: Stage | None  # what `make search` wrote, if it was run
+    beyond: tuple[Stage, ...]  # every stage beyond the paper's own runs
+    made_from: Mapping[str, str]  # `identity.inputs` of the report itself
+    missing: tuple[int, ...]  # of the seeds asked for, those of which a stage is missing, where that is allowed
+    left_out: tuple[str, ...]  # notebooks with a result among those beyond that was made from other inputs than there are now
 
     @cached_property
     def n_seeds(self) -> int:
@@ -107,8 +93,7 @@ def collect(
 ) -> Results:
     """Read every stage of every case and seed below `root`; claims, budget, trials and limits where they were run and still hold.
 
-    Args:
-        missing_allowed: leave out a seed of which a stage is missing, as long as another seed is whole.
+    Where it is allowed, a seed of which a stage is missing is left out, as long as another seed is whole.
 
     Raises:
         ArtifactError: if a stage is missing or damaged, or one of the paper's own runs was made from other parameters, code,

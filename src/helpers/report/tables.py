@@ -88,9 +88,7 @@ def table_1(cases: Mapping[int, CaseParams], process: ProcessParams) -> pd.DataF
 def spread(numbers: Mapping[str, Any] | pd.Series, decimals: int | None = None, unit: str = "") -> str:
     """A median with its interval as text: 16.8 [16.5, 17.0]; the median alone where there is no interval or no spread at all.
 
-    Args:
-        numbers: median, ci_low and ci_high.
-        decimals: digits after the point, instead of three significant digits of the greatest of them.
+    `numbers` holds median, ci_low and ci_high, shown with so many decimals or, without, three significant digits of the greatest.
     """
     values = [float(numbers[name]) for name in ("median", "ci_low", "ci_high")]
     if np.isnan(values[0]):
@@ -104,10 +102,7 @@ def spread(numbers: Mapping[str, Any] | pd.Series, decimals: int | None = None, 
 
 
 def results_table(compared: pd.DataFrame, feature_names: Sequence[str]) -> pd.DataFrame:
-    """Table 2, 3 or 4 as text: each printed row and, below it, our median, the interval of one run, if any, and the verdict.
-
-    `compared` holds the rows of one case in the comparison with the paper.
-    """
+    """Table 2, 3 or 4 as text, from one case of the comparison: printed row, our median, the interval of a run, the verdict."""
     rows = []
     for row, decimals in RESULT_DECIMALS.items():
         numbers = compared[compared["row"] == row].set_index("feature").loc[list(feature_names)]
@@ -125,10 +120,7 @@ def results_table(compared: pd.DataFrame, feature_names: Sequence[str]) -> pd.Da
 
 
 def quality_table(medians: pd.DataFrame, process: ProcessParams) -> pd.DataFrame:
-    """Control quality of one case as text, a row for each figure of merit and a column for each controller.
-
-    `medians` has the columns stage, metric, median, ci_low, ci_high.
-    """
+    """Control quality of one case (columns stage, metric, median, ci_low, ci_high) as text: figures of merit by controller."""
     labels: dict[str, tuple[str, int, int | None]] = {  # of each metric its label, factor and digits after the point
         "objective_x": ("$J$ on $x$", 1, 2),
         "share": ("$J$ on $x$, % of minimum variance", 100, 1),
@@ -208,11 +200,8 @@ def render(value: Any) -> str:
 def to_markdown(frame: pd.DataFrame, digits: int = 4, labels: Mapping[str, str] | None = None) -> str:
     """A pipe table for pandoc, without the index; columns of numbers, with or without an interval, to the right.
 
-    Feature names and the quantities of Tables 2-4 are typeset, Markdown's own characters are escaped.
-
-    Args:
-        digits: significant digits of a number that is not an integer.
-        labels: headers by column, instead of the column's name with spaces for underscores.
+    Feature names and the quantities of Tables 2-4 are typeset, Markdown's own characters are escaped. A number that is not an
+    integer has so many significant digits; `labels` are headers by column, instead of its name with spaces for underscores.
     """
     cells = pd.DataFrame({column: [_cell(value, digits) for value in frame[column]] for column in frame.columns})
     align = ["right" if all(map(NUMBER.fullmatch, cells[column])) else "left" for column in cells] if len(cells) else None

@@ -52,10 +52,8 @@ def render(template: str, folder: Path, **values: Any) -> str:
 def numbered(text: str) -> str:
     """The Markdown with a number for every `#fig:name#` (tab, eq), in their order, and a link for every `@fig:name`.
 
-    What stands in a fold, `#A:fig:name#`, is counted apart. A number leads back to the first link to it.
-
-    Raises:
-        KeyError: for a link to what does not exist.
+    What stands in a fold, `#A:fig:name#`, is counted apart. A number leads back to the first link to it; a link to what does not
+    exist raises KeyError.
     """
     counts: Counter[str] = Counter()
     numbers: dict[str, str] = {}

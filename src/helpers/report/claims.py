@@ -66,10 +66,7 @@ def load_claims(root: Path) -> dict[str, Claim]:
 
 
 def collect(claims: Mapping[str, Claim], stages: Mapping[tuple[int, int, str], Stage]) -> pd.DataFrame:
-    """Every number that the claims refer to, from the scores.csv of the stages, by case, seed and name.
-
-    A row for each case and quantity (<stage>/<run>/<metric>), its index, and a column for each seed; nan where it was not run.
-    """
+    """Every number that the claims refer to, by case and quantity (<stage>/<run>/<metric>), a column a seed; nan where not run."""
     pairs = ((claim.cases, quantity) for claim in claims.values() for quantity in claim.quantities.values())
     wanted = {(case, reference) for cases, quantity in pairs for case in cases for _, reference in quantity if reference}
     rows = [pd.DataFrame(columns=[*INDEX, "seed", "value"])]

@@ -1,8 +1,7 @@
 """Figures 3-6, learning curves and the curve of the online budget.
 
-Every table may hold several runs, told apart by a column `seed`: each is then a thin line, their median a thick one. Every
-figure is drawn from tables and computes no result; `drawn_summary` reads back what was really drawn, and is the text form of
-every figure: a notebook shows the picture, and the numbers beneath it are what a later run is compared with.
+Every table may hold several runs, told apart by a column `seed`: each is then a thin line, their median a thick one.
+`drawn_summary`, what was really drawn, is the text form of every figure, which a notebook's later run is compared with.
 """
 
 from collections.abc import Mapping, Sequence
@@ -99,7 +98,6 @@ def control_figure(
     Args:
         response: columns of `stages.response_table`, and `seed` where there are several runs.
         set_point: of each loop, deviation variables.
-        descriptions: of variables in words, by name.
         zoom_from: first sample of the zoom; None: no zoom.
         size: width and height in inches, where the figure is not as wide as the report.
     """
@@ -147,10 +145,8 @@ def learning_curves(
 ) -> Figure:
     """Mean return, feature gap and reward weights against the epoch; a panel for each that the history holds.
 
-    Args:
-        history: columns epochs and mean_return, and where they exist feature_gap, alpha:<feature> and seed.
-        marks: epochs worth a vertical line, and why.
-        return_levels, gap_levels: horizontal lines by label, such as the expert's return or the paper's gap.
+    `history` has the columns epochs and mean_return, and where they exist feature_gap, alpha:<feature> and seed; `marks` are epochs
+    worth a vertical line, and why; the levels are horizontal lines by label, such as the expert's return or the paper's gap.
     """
     names = [column.removeprefix("alpha:") for column in history if column.startswith("alpha:")]
     panels = {"Mean return": ("discounted return (no unit)", return_levels or {})}  # label of the axis, horizontal lines

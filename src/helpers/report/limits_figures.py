@@ -56,7 +56,7 @@ GRIDS = {  # of each group of conditions: title, label of the rows, label of the
 
 
 def gap_figure(gaps: pd.DataFrame) -> Figure:
-    """Gaps to the dynamic programme (columns case, controller, gap, gap_low, gap_high, in per cent); a panel for each case."""
+    """Gaps to the dynamic programme and 95 % intervals (columns case, controller, gap, gap_low, gap_high, in per cent), by case."""
     listed = [name for name in LABELS if name in set(gaps["controller"])][::-1]
     figure = empty_figure(WIDTH, 0.6 + 0.27 * len(listed))
     panels = np.atleast_1d(figure.subplots(1, gaps["case"].nunique(), sharey=True))

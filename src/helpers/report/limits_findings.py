@@ -19,8 +19,7 @@ END_IN_GRADIENT = ("online", "irl_reinforce", "irl_alone", "clone_reinforce", "c
 def find(results: Results) -> dict[str, Any]:
     """What the section says, by the name of the function below that found it; nothing where notebook 06 was not run.
 
-    Besides, seeds: how many there are of each case; agreement: the largest difference between the programme's value and that of its
-    policy by Monte Carlo, in per cent.
+    seeds: how many of each case; agreement: how far at most the programme's value is from that of its policy by Monte Carlo, in %.
     """
     gaps, grids = (read(results, "attainable", name) for name in ("gaps.csv", "grids.csv"))
     if gaps.empty:
@@ -127,10 +126,8 @@ def left_out(results: Results) -> dict[str, dict[int, tuple[int, int]]]:
     robust = read(results, "robustness", "robustness.csv")
     total = robust.drop_duplicates(["case", "group", "row", "column"]).groupby(["group", "case"]).size()
     out = unholdable(results).groupby(["group", "case"]).size()
-    found: dict[str, dict[int, tuple[int, int]]] = {}
-    for (group, case), count in out.items():
-        found.setdefault(group, {})[int(case)] = (int(count), int(total[group, case]))
-    return found
+    groups = out.index.unique("group")
+    return {group: {case: (count, total[group, case]) for case, count in out[group].items()} for group in groups}
 
 
 def out_of_reach(results: Results) -> dict[str, list[int]]:

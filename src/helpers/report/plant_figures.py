@@ -145,8 +145,8 @@ def _panels(description: PlantDescription, each: float, beside: float) -> tuple[
     axes = figure.subplots(len(variables), 1, sharex=True, squeeze=False)[:, 0]
     looks = []
     for axis, variable in zip(axes, variables, strict=True):
-        title = f"{capital(variable.description or variable.name)} ({variable.tag})"
-        head(axis, "", title, variable.name, ylabel=variable.unit)
+        words = capital(variable.description or variable.name)
+        head(axis, "", f"{words} ({variable.tag})", variable.name, ylabel=variable.unit)
         held = variable not in description.controlled
         colour = COLOURS["manipulated" if held else "controlled", "agent"]
         looks.append({"color": colour, "drawstyle": "steps-post" if held else "default"})

@@ -8,8 +8,8 @@ import argparse
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 import torch
@@ -50,8 +50,7 @@ MEANINGLESS = 10.0  # a relative feature gap beyond which a feature of the recor
 NAMES = ("policy.onnx", f"policy{STATIC}.onnx", "policy.c", "report.md")  # what the command writes beside its figures
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """What the command found; tables and figures by name, and the sentences of the report, the verdict first."""
 
     tables: dict[str, pd.DataFrame]
@@ -114,10 +113,9 @@ def offline(plant: OwnPlant, workshop: Workshop) -> tuple[dict[str, pd.DataFrame
 
 
 def work(path: Path, folder: Path, params_root: Path, scale: str, seed: int) -> tuple[str, Outcome]:
-    """The whole chain for one description; policy files go into `folder`. Returns the title and what was found.
+    """The whole chain for one description: its title and what was found; policy files go into `folder`.
 
-    Raises:
-        InputError: in one sentence, if something that was given cannot be used. OSError: if `folder` cannot be written.
+    What cannot be used is refused by an InputError in one sentence; OSError if `folder` cannot be written.
     """
     params = load(params_root, 1)
     torch.set_num_threads(params.learning.scales[scale].threads)

@@ -126,10 +126,8 @@ def comparison(
     sampling variance they lack, s^2 (1/500 - 1/K), is added. Weights carry no such error beyond their run's own.
     A number that no seed gave is nan with n_seeds 0.
 
-    Args:
-        seeds: columns case, seed, stage, metric, value; `medians`: their `summary`.
-        trajectories: K of each row that holds features.
-        sampling_errors: s/sqrt(500) by case and feature, where another than that of our own trajectories is to be taken.
+    `medians` are the `summary` of the seeds (columns case, seed, stage, metric, value), `trajectories` are K of each row that holds
+    features, and `sampling_errors` s/sqrt(500) by case and feature, where another than our own is to be taken.
     """
     found = medians.set_index(KEYS)
     runs = {key: group.dropna().to_numpy() for key, group in seeds.groupby(KEYS)["value"]}

@@ -143,10 +143,7 @@ def quality_table(medians: pd.DataFrame, process: ProcessParams) -> pd.DataFrame
 
 
 def variants_table(medians: pd.DataFrame) -> pd.DataFrame:
-    """Feature gap, in per cent, and cost of each way of offline learning: median, 95 % interval and the worst seed of the gap.
-
-    `medians` has the columns case, stage, metric, n_seeds, median, ci_low, ci_high, greatest.
-    """
+    """Gap in per cent (median, 95 % interval, worst seed) and cost of each way of offline learning, from a `scorecard.summary`."""
     rows = []
     for (case, stage), group in medians[medians["stage"].isin(LEARNING)].groupby(["case", "stage"]):
         found = group.set_index("metric")

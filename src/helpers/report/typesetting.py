@@ -14,7 +14,7 @@ import typst
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image
 
-from helpers.report import tables
+from helpers.report.tables import ROMAN, to_markdown
 from helpers.runs.sources import PROJECT
 
 PALETTE = 64  # colours of a picture inside a drawing, each with its own opacity
@@ -35,8 +35,8 @@ def environment() -> Environment:
         comment_end_string="##}",
     )
     found.filters["percent"] = lambda share: f"{100 * share:.1f} %"
-    found.filters["numeral"] = lambda case: tables.ROMAN[case - 1]
-    found.filters["table"] = tables.to_markdown
+    found.filters["numeral"] = lambda case: ROMAN[case - 1]
+    found.filters["table"] = to_markdown
     return found
 
 

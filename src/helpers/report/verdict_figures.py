@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, NullLocator
@@ -109,6 +108,7 @@ def weights_figure(history: pd.DataFrame, compared: pd.DataFrame) -> Figure:
     *panels, last = figure.subplots(1, len(loops) + 1)
     styles = feature_styles(list(printed.index))
     width = max(1, round(SMOOTH * history["epochs"].nunique()))
+    below: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.17), "frameon": False, "columnspacing": 1}
     for letter, axes, loop in zip(ascii_uppercase, panels, loops, strict=False):
         for name in printed.index[printed.index.str.rpartition("-").get_level_values(0) == loop]:
             runs = history.pivot_table(index="epochs", columns="seed", values=f"alpha:{name}").rolling(width, min_periods=1).mean()
@@ -118,27 +118,22 @@ def weights_figure(history: pd.DataFrame, compared: pd.DataFrame) -> Figure:
             axes.fill_between(runs.index, low, high, color=style["color"], alpha=0.15, linewidth=0)
             star: Any = {"marker": "*", "markersize": 9, "color": style["color"], "clip_on": False}
             axes.plot([runs.index[-1]], [printed.loc[name, "published"]], **star)
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=3, frameon=False, handlelength=2, columnspacing=1)
+        axes.legend(ncols=3, handlelength=2, **below)
         ylabel = "weight (no unit)" if loop == loops[0] else ""
         head(axes, letter, f"Loop of {symbol(loop)}", f"{letter} {loop}", xlabel="epoch", ylabel=ylabel, ylim=(-1, 1))
         axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
-    _beside_the_printed(last, ascii_uppercase[len(loops)], printed)
-    return figure
-
-
-def _beside_the_printed(axes: Axes, letter: str, printed: pd.DataFrame) -> None:
-    """Each weight with its interval for one run, by its verdict, and the printed one as a star."""
-    head(axes, letter, "Learned and printed", "printed", xlabel="weight (no unit)")
+    # Beside them each weight with its interval for one run, by its verdict, and the printed one as a star.
+    head(last, ascii_uppercase[len(loops)], "Learned and printed", "printed", xlabel="weight (no unit)")
     heights = range(0, -len(printed), -1)
     for y, (name, row) in zip(heights, printed.iterrows(), strict=True):
-        axes.plot([row["pred_low"], row["pred_high"]], [y, y], color=MARKS[row["verdict"]]["color"])
-        axes.plot([row["reproduced"]], [y], label=f"ours {name}", markersize=6, **MARKS[row["verdict"]])
-        axes.plot([row["published"]], [y], label=f"printed {name}", marker="*", markersize=9, color=INK)
-    axes.axvline(0, color=MUTED, linewidth=1)
-    axes.set_yticks(list(heights), [feature_symbol(name) for name in printed.index])
+        last.plot([row["pred_low"], row["pred_high"]], [y, y], color=MARKS[row["verdict"]]["color"])
+        last.plot([row["reproduced"]], [y], label=f"ours {name}", markersize=6, **MARKS[row["verdict"]])
+        last.plot([row["published"]], [y], label=f"printed {name}", marker="*", markersize=9, color=INK)
+    last.axvline(0, color=MUTED, linewidth=1)
+    last.set_yticks(list(heights), [feature_symbol(name) for name in printed.index])
     star = Line2D([], [], marker="*", color=INK, linestyle="", markersize=9, label="printed")
-    place: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.17), "ncols": 2, "frameon": False, "columnspacing": 1}
-    axes.legend(handles=[star, *_handles(printed["verdict"].unique(), printed["verdict"])], **place)
+    last.legend(handles=[star, *_handles(printed["verdict"].unique(), printed["verdict"])], ncols=2, **below)
+    return figure
 
 
 def profiles_figure(profiles: pd.DataFrame, settings: pd.DataFrame) -> Figure:

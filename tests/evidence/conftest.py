@@ -11,12 +11,23 @@ FEW = {"epoch_share": 0.001, "episodes": 4, "measured": 2, "evaluation": 20, "ex
 
 
 @pytest.fixture(scope="session")
-def short(root, tmp_path_factory):
-    """A session of a case with those parameters."""
-    roots = {"params_root": str(root), "input_root": "", "output_root": str(tmp_path_factory.mktemp("results"))}
+def opened(root, tmp_path_factory):
+    """A session of a notebook at smoke scale, with results of its own."""
+
+    def build(notebook, **given):
+        roots = {"params_root": str(root), "input_root": "", "output_root": str(tmp_path_factory.mktemp("results"))}
+        return open_session(notebook, {"seed": 0, "scale": "smoke"} | roots | given)
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def short(opened, tmp_path_factory):
+    """A session of a case with those parameters; all in one folder, so that nothing is trained twice."""
+    folder = str(tmp_path_factory.mktemp("short"))
 
     def build(case, notebook="08_claims"):
-        session = open_session(notebook, {"case": case, "seed": 0, "scale": "smoke", **roots})
+        session = opened(notebook, case=case, output_root=folder)
         return replace(session, scale_params=session.scale_params.model_copy(update=FEW))
 
     return build

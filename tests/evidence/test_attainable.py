@@ -30,9 +30,8 @@ def test_the_expected_reward_is_the_integral(mean, std, beta, skewness):
 
 
 @pytest.mark.parametrize(("beta", "place", "tried"), [(10.0, 3 * 9 + 6, (4, 0)), (30.0, 3 * 9 + 5, (3, 0))])
-def test_rewards_and_transitions_are_those_of_the_process(study, beta, place, tried):
+def test_rewards_and_transitions_are_those_of_the_process(case, beta, place, tried):
     """Monte Carlo through the process itself: the reward, and the expectation of what a cubic spline holds exactly."""
-    case = study(1)
     axes = (np.linspace(-4, 3, 9), np.linspace(-8, 12, 9))
     step = one_step(case.process, case.task, beta, axes, Resolution(9, 5, 5))
     x = torch.tensor([[axes[0][place // 9], axes[1][place % 9]]], dtype=torch.float64).expand(400_000, -1)
@@ -86,8 +85,7 @@ def test_inputs_may_move_each_others_states(study):
     np.testing.assert_allclose(values[0], values[1], rtol=2e-3)
 
 
-def test_the_stationary_policy_stays_that_of_the_first_sample(study):
-    case = study(1)
+def test_the_stationary_policy_stays_that_of_the_first_sample(case):
     axes = (np.linspace(-2, 1, 7), np.linspace(-3, 5, 7))
     optimum = dynamic_programme(case.process, case.task, 10.0, 0.99, axes, Resolution(7, 5, 3))
     policy = Tabulated(optimum, stationary=True)

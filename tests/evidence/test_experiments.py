@@ -10,7 +10,6 @@ import torch
 from helpers.evidence import alternatives, experiments
 from helpers.evidence.experiments import attempt, first_epoch, prepare, response_figures
 from helpers.plant.task import Trajectories
-from helpers.runs.session import open_session
 
 
 def test_response_figures_by_hand(prepared):
@@ -57,9 +56,8 @@ def test_where_no_reward_can_be_found_the_policy_stays_as_it_was(prepared):
     assert torch.equal(before, after)  # the start itself was not trained
 
 
-def test_the_online_run_of_notebook_03_is_taken_over_and_would_come_out_the_same(root, tmp_path):
-    given = {"case": 1, "seed": 0, "scale": "smoke", "params_root": str(root), "input_root": "", "output_root": str(tmp_path)}
-    run = prepare(open_session("08_claims", given))
+def test_the_online_run_of_notebook_03_is_taken_over_and_would_come_out_the_same(opened):
+    run = prepare(opened("08_claims", case=1))
     betas = run.session.params.case.online.beta
     policy, curve = experiments.from_imitator(run, list(betas))
     assert policy is run.improved

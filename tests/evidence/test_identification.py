@@ -10,13 +10,13 @@ import torch
 from scipy.integrate import solve_ivp
 
 from helpers.evidence.identification import Fit, Problem, Profile, polish, profile, refit, search, steps
-from helpers.evidence.readings import GAINS, MAIN, READINGS, TIME, Reading, ReadProcess, exact_drift, simulate, with_settings
-from helpers.plant.process import LinearProcess
+from helpers.evidence.readings import GAINS, MAIN, READINGS, TIME, Reading, ReadProcess, simulate, with_settings
 from helpers.plant.rollout import rollout, stream
 from helpers.runs.request import PROJECT
 from helpers.settings.evidence import load_identification
 from helpers.settings.leaf import ParameterError
 from helpers.settings.paper import load
+from tests.plant.test_rollout import CALM, plain_loop
 
 ROOT = PROJECT / "params"
 CASES = {case: load(ROOT, case) for case in (1, 2, 3)}
@@ -36,9 +36,6 @@ def features(reading, params=FIRST):
     return simulate(params, {}, reading, 40, draws()).v
 
 
-# Readings ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("case", CASES)
 def test_the_first_reading_without_settings_is_the_demonstrator_of_the_parameter_files(study, case):
     filed = study(case)
@@ -49,14 +46,11 @@ def test_the_first_reading_without_settings_is_the_demonstrator_of_the_parameter
 def test_settings_take_the_place_of_those_of_the_files():
     values = {TIME: 0.03, BOUND_T: 50.0, ("input_low", "C_A0"): -7.0, ("integral", "T"): 99.0}
     params = with_settings(FIRST, values, Reading(noise_as_variance=True, start_as_variance=True, samples=49, integration_steps=3))
-    high = FIRST.process.input_high
-    assert params.process.sampling_time == 0.03
-    assert params.process.input_low == (-7.0, -50.0)
-    assert params.process.input_high == (high[0], 50.0)
-    assert (params.process.horizon, params.process.integration_steps) == (49, 3)
-    assert params.demonstrator.integral == (FIRST.demonstrator.integral[0], 99.0)
-    assert params.demonstrator.proportional == FIRST.demonstrator.proportional
-    assert FIRST.process.sampling_time != 0.03  # the files' record stays as it was
+    changes = {"sampling_time": 0.03, "input_low": (-7.0, -50.0), "input_high": (FIRST.process.input_high[0], 50.0)}
+    changes |= {"horizon": 49, "integration_steps": 3, "observation_noise": params.process.observation_noise}
+    assert params.process == FIRST.process.model_copy(update=changes)  # nothing else; and the files' record stays as it was
+    integral = FIRST.demonstrator.integral[0], 99.0
+    assert params.demonstrator == FIRST.demonstrator.model_copy(update={"integral": integral})
     assert [value**2 for value in params.process.observation_noise] == pytest.approx(FIRST.process.observation_noise)
     assert [value**2 for value in params.case.initial_std] == pytest.approx(FIRST.case.initial_std)
 
@@ -67,27 +61,9 @@ def test_the_exact_drift_is_the_solution_of_the_undisturbed_equation():
     A, B = np.array(process.drift_state), np.array(process.drift_input)
     x, u = np.array([0.7, -1.3]), np.array([9.0, -31.0])
     solved = solve_ivp(lambda _, z: A @ z + B @ u, (0, process.sampling_time), x, rtol=1e-10, atol=1e-12).y[:, -1]
-    step = LinearProcess(exact_drift(process), torch.float64)
-    found = step.step(torch.tensor(x)[None], torch.tensor(u)[None], torch.zeros(1, 8).double())[0]
+    exact = ReadProcess(process, Reading(exact_drift=True), torch.Generator())
+    found = exact.step(torch.tensor(x)[None], torch.tensor(u)[None], torch.zeros(1, 8).double())[0]
     np.testing.assert_allclose(found.numpy(), solved, rtol=1e-8)
-    euler = LinearProcess(process, torch.float64).step(torch.tensor(x)[None], torch.tensor(u)[None], torch.zeros(1, 8).double())[0]
-    assert np.abs(euler.numpy() - solved).max() > 1e-3
-
-
-def test_finer_steps_keep_the_mean_of_the_exact_drift_and_spread_as_an_integral():
-    """One loop without coupling at rest: x' = a x + b u + d x w has a mean and a second moment in closed form over a sample."""
-    a, b, d, dt, x0, u0 = -4.0, 0.5, 0.5, 0.04, 1.0, 20.0
-    update = {"drift_state": ((a, 0.0), (0.0, a)), "drift_input": ((b, 0.0), (0.0, b)), "disturbance": (d, d)}
-    update |= {"sampling_time": dt, "integration_steps": 16}
-    generator = torch.Generator().manual_seed(0)
-    finer = ReadProcess(FIRST.process.model_copy(update=update), MAIN, generator)
-    ones = torch.ones(200_000, 2, dtype=torch.float64)
-    x = finer.step(x0 * ones, u0 * ones, torch.randn(len(ones), finer.n_disturbances, generator=generator, dtype=torch.float64))
-    moments = solve_ivp(
-        lambda _, m: [a * m[0] + b * u0, (2 * a + d**2) * m[1] + 2 * b * u0 * m[0]], (0, dt), [x0, x0**2], rtol=1e-10, atol=1e-12
-    ).y[:, -1]
-    assert x.mean().item() == pytest.approx(moments[0], rel=2e-3)
-    assert x.var().item() == pytest.approx(moments[1] - moments[0] ** 2, rel=2e-2)
 
 
 def test_the_error_of_the_initial_state_takes_the_place_of_the_number(study):
@@ -100,51 +76,23 @@ def test_the_error_of_the_initial_state_takes_the_place_of_the_number(study):
     torch.testing.assert_close(own[:, 4:] - given[:, 4:], (FIRST.features.initial_error - first) / FIRST.process.sampling_time)
 
 
-def one_loop_by_hand(n_steps, reading):
-    """Commands of both loops of case 1 in plain floats, without noise."""
-    process, gains, target = FIRST.process, FIRST.demonstrator, FIRST.case.set_point
-    A, B, dt, m = np.array(process.drift_state), np.array(process.drift_input), process.sampling_time, process.integration_steps
-    x, total, commands = np.zeros(2), np.zeros(2), []
-    before = np.zeros(2) if reading.derivative_from_zero else None
-    kp, ki, kd = (np.array(getattr(gains, kind)) for kind in GAINS)
-    last = np.array(target) - x
-    for _ in range(n_steps):
-        error, last = (last if reading.delay else np.array(target) - x), np.array(target) - x
-        tried = total + error * dt
-        if reading.bounded_integral:
-            tried = np.clip(ki * tried, process.input_low, process.input_high) / ki
-        seen = tried - (1 - reading.present_error) * error * dt
-        smooth = error if before is None else reading.error_memory * before + (1 - reading.error_memory) * error
-        rate = 0.0 if before is None else (smooth - before) / dt
-        command = kp * error + ki * seen + kd * rate
-        u = np.clip(command, process.input_low, process.input_high)
-        frozen = (u != command) & (np.sign(error) == np.sign(command)) & reading.conditional_integration
-        total, before = np.where(frozen, total, tried), smooth
-        commands.append(command)
-        for _ in range(m):
-            x = x + (A @ x + B @ u) * dt / m
-    return np.array(commands)
-
-
 @pytest.mark.parametrize(
     "changes",
-    [{}]
-    + [{name: True} for name in ("conditional_integration", "derivative_from_zero", "bounded_integral", "delay")]
+    [{name: True} for name in ("conditional_integration", "derivative_from_zero", "bounded_integral", "delay")]
     + [{name: 0.5} for name in ("present_error", "error_memory")],
 )
 def test_the_pid_of_a_reading_without_noise(changes, monkeypatch):
-    process = FIRST.process.model_copy(update={"observation_noise": (0.0, 0.0), "disturbance": (0.0, 0.0)})
+    process = FIRST.process.model_copy(update=CALM)
     calm = replace(FIRST, process=process, case=FIRST.case.model_copy(update={"initial_std": (0.0, 0.0)}))
-    seen, reading = [], Reading(first_error=None, **changes)
+    seen = []
 
     def watched(*arguments):
         seen.append(rollout(*arguments))
         return seen[-1]
 
     monkeypatch.setattr("helpers.evidence.readings.rollout", watched)
-    simulate(calm, {}, reading, 2, draws())
-    expected = one_loop_by_hand(seen[0].n_steps, reading)
-    np.testing.assert_allclose(seen[0].command[:, 0].numpy(), expected, rtol=1e-9, atol=1e-9)
+    simulate(calm, {}, Reading(first_error=None, **changes), 2, draws())
+    np.testing.assert_allclose(seen[0].command[:, 0].numpy(), plain_loop(FIRST, [0.0, 0.0], **changes)[1], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -191,19 +139,16 @@ def test_what_the_controller_sees_and_what_the_types_are_taken_of():
     assert len({reading.name for reading in READINGS}) == len({replace(reading, name="") for reading in READINGS}) == len(READINGS)
 
 
-def test_an_unstable_loop_costs_much_and_stays_finite():
-    problem = known().holding({TIME: 0.5})
-    assert np.isfinite(problem.loss(problem.position(TRUTH), 20))
-    assert problem.loss(problem.position(TRUTH), 20) > 1e4
+def test_an_unstable_loop_costs_much_and_stays_finite(problem):
+    unstable = problem.holding({TIME: 0.5})
+    assert 1e4 < unstable.loss(unstable.position(TRUTH), 20) < np.inf
 
 
-# Fits ----------------------------------------------------------------------------------------------------------------
-
-
-def known(**changes):
+@pytest.fixture(scope="module")
+def problem():
     """A problem whose rows were made with known settings, on the same draws: its loss is zero there."""
     rows = {case: simulate(CASES[case], TRUTH, AS_FILED, 60, draws(case=case)) for case in (1, 3)}
-    problem = Problem(
+    return Problem(
         cases={case: CASES[case] for case in rows},
         published={case: row.mean for case, row in rows.items()},
         sampling_error={case: row.sampling_error(500) for case, row in rows.items()},
@@ -211,29 +156,25 @@ def known(**changes):
         seed=0,
         reading=AS_FILED,
     )
-    return replace(problem, **changes)
 
 
-def test_the_loss_counts_squared_sampling_errors():
-    problem, v = known(), simulate(CASES[1], TRUTH, AS_FILED, 60, draws())
-    np.testing.assert_allclose(problem.sampling_error[1], np.std(v.v.numpy(), axis=0, ddof=1) / np.sqrt(500))
+def test_the_loss_counts_squared_sampling_errors(problem):
+    v = simulate(CASES[1], TRUTH, AS_FILED, 60, draws()).v.numpy()
+    np.testing.assert_allclose(problem.sampling_error[1], np.std(v, axis=0, ddof=1) / np.sqrt(500))
     z = problem.position(TRUTH)
     assert problem.loss(z, 60) == pytest.approx(0.0, abs=1e-18)
     shifted = {case: np.asarray(row) + 2 * problem.sampling_error[case] for case, row in problem.published.items()}
     assert replace(problem, published=shifted).loss(z, 60) == pytest.approx(12 * 4)
 
 
-def test_overshoot_costs_where_it_is_not_allowed():
-    problem = known()
-    z = problem.position(TRUTH)
+def test_overshoot_costs_where_it_is_not_allowed(problem):
     mean = [simulate(CASES[case], TRUTH, AS_FILED, 60, draws(case=case)).overshoot.numpy() for case in (1, 3)]
     assert max(values.max() for values in mean) > 0.1
     expected = sum(((values / 0.02) ** 2).sum() for values in mean)
-    assert replace(problem, overshoot_unit=0.02).loss(z, 60) == pytest.approx(expected)
+    assert replace(problem, overshoot_unit=0.02).loss(problem.position(TRUTH), 60) == pytest.approx(expected)
 
 
-def test_known_settings_are_found_again():
-    problem = known()
+def test_known_settings_are_found_again(problem):
     size = {"evaluations_reading": 60, "draws_search": 60, "draws": 60, "iterations": 30}
     scale = load_identification(ROOT, FIRST).scales["smoke"].model_copy(update=size)
     found = refit(problem, {TIME: 0.04, BOUND_T: 60.0}, scale)
@@ -241,8 +182,7 @@ def test_known_settings_are_found_again():
     assert found.settings == pytest.approx(TRUTH, rel=1e-3)
 
 
-def test_the_search_uses_no_global_randomness_and_repeats_itself():
-    problem = known()
+def test_the_search_uses_no_global_randomness_and_repeats_itself(problem):
     np.random.seed(3)  # noqa: NPY002
     before = np.random.get_state()[1].copy()  # noqa: NPY002
     found = [search(problem, np.array([0.6, 0.6]), 18, 20, np.random.default_rng(seed)) for seed in (1, 1, 2)]
@@ -251,15 +191,12 @@ def test_the_search_uses_no_global_randomness_and_repeats_itself():
     assert (found[0] != found[2]).any()
 
 
-def test_what_is_held_is_neither_searched_nor_lost():
-    problem = known().holding({BOUND_T: 45.0})
-    assert list(problem.free) == [TIME]
-    found = polish(problem, problem.position({TIME: 0.045}), 30, 60)
+def test_what_is_held_is_neither_searched_nor_lost(problem):
+    held = problem.holding({BOUND_T: 45.0})
+    assert list(held.free) == [TIME]
+    found = polish(held, held.position({TIME: 0.045}), 30, 60)
     assert found.settings == pytest.approx(TRUTH, rel=1e-3)
-    assert known(free={}, fixed=TRUTH).holding({}).settings(np.array([])) == TRUTH
-
-
-# Profiles ------------------------------------------------------------------------------------------------------------
+    assert held.holding({TIME: 0.05}).holding({}).settings(np.array([])) == TRUTH
 
 
 def test_the_interval_of_a_parabola_is_exact():
@@ -270,9 +207,8 @@ def test_the_interval_of_a_parabola_is_exact():
     assert parabola.interval(1000.0) == (1.0, 9.0)
 
 
-def test_a_profile_fits_the_other_settings_again():
+def test_a_profile_fits_the_other_settings_again(problem):
     """Its points lie below those of a cut through the loss, and its floor is where the settings are."""
-    problem = known()
     scale = load_identification(ROOT, FIRST).scales["smoke"].model_copy(update={"draws": 60, "iterations": 20})
     truth = Fit(TRUTH, problem.position(TRUTH), 0.0)
     found = profile(problem, truth, TIME, 1e9, scale)
@@ -294,9 +230,6 @@ def test_the_steps_of_a_profile_grow_and_end_at_the_ends_of_the_search():
     assert down[-1] == 0.1
     assert (np.diff(np.diff(up[:-1])) > 0).all()
     assert list(steps(1.0, 0.1, 50, 1)) == []
-
-
-# Files ---------------------------------------------------------------------------------------------------------------
 
 
 def test_a_wrong_file_is_one_sentence(tmp_path):

@@ -17,7 +17,6 @@ from helpers.evidence.gym_environment import TrackingEnv  # noqa: E402
 from helpers.evidence.library_learners import HeadStartPolicy, LibraryController, TrackingEnvs, learn, library_learner  # noqa: E402
 from helpers.learning.features import tracking_reward  # noqa: E402
 from helpers.plant.rollout import rollout, stream  # noqa: E402
-from helpers.runs.session import open_session  # noqa: E402
 from helpers.settings.limits import load_limits  # noqa: E402
 
 
@@ -103,9 +102,8 @@ def test_learners_learn_and_become_controllers(study, root, name):
 
 
 @pytest.mark.parametrize("name", ["ppo", "recurrent_ppo"])
-def test_an_interrupted_run_does_not_repeat_a_learner_that_has_ended(root, tmp_path, monkeypatch, name):
-    given = {"case": 2, "seed": 0, "scale": "smoke", "params_root": str(root), "input_root": "", "output_root": str(tmp_path)}
-    contest = limits.enter(open_session("06_limits_and_alternatives", given))
+def test_an_interrupted_run_does_not_repeat_a_learner_that_has_ended(opened, monkeypatch, name):
+    contest = limits.enter(opened("06_limits_and_alternatives", case=2))
     scale = contest.scale.model_copy(update={"episodes": 100, "every": 50, "judged": 20})
     contest = replace(contest, limits=contest.limits.model_copy(update={"scales": {"smoke": scale}}))
     first = equal_budget.from_library(contest, name)

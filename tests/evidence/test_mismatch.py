@@ -6,8 +6,7 @@ from helpers.evidence.mismatch import Delayed, LoadStep
 from helpers.plant.rollout import rollout, stream
 
 
-def test_the_load_comes_at_mid_horizon_in_every_batch(study):
-    case = study(1)
+def test_the_load_comes_at_mid_horizon_in_every_batch(case):
     load = torch.tensor([0.5, -1.0], dtype=torch.float64)
     plant = LoadStep(case.process, case.task, load)
     half = case.task.n_steps // 2
@@ -18,8 +17,7 @@ def test_the_load_comes_at_mid_horizon_in_every_batch(study):
         assert torch.allclose(loaded.x[half + 1] - plain.x[half + 1], load.expand(3, -1))
 
 
-def test_commands_arrive_late(study):
-    case = study(1)
+def test_commands_arrive_late(case):
     plain = rollout(case.process, case.pid, case.task, 3, stream(0, "late"))
     late = rollout(case.process, Delayed(case.pid, case.task, 2), case.task, 3, stream(0, "late"))
     assert not late.command[:2].any()

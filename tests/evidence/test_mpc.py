@@ -10,9 +10,8 @@ from helpers.evidence.mpc import OffsetFreeMPC
 from helpers.plant.rollout import rollout, stream
 
 
-def test_the_plan_minimises_the_cost_inside_the_bounds(study):
+def test_the_plan_minimises_the_cost_inside_the_bounds(case):
     """The cost simulated step by step and minimised by L-BFGS-B, from a state where bounds are active."""
-    case = study(1)
     controller = OffsetFreeMPC(case.process, case.task, 4, 0.01, 0.1)
     A, B = case.process.state_step.numpy(), case.process.input_step.numpy()
     target, scale = case.task.set_point.numpy(), case.task.error_scale.numpy()
@@ -49,8 +48,7 @@ def test_no_offset_remains_after_an_unmeasured_load(study):
     assert ends["known"] == pytest.approx(0.03, rel=1e-3)  # one step of the load, for ever
 
 
-def test_a_short_horizon_without_move_penalty_is_minimum_variance(study):
-    case = study(1)
+def test_a_short_horizon_without_move_penalty_is_minimum_variance(case):
     controller = OffsetFreeMPC(case.process, case.task, 1, 1e-9, 0.1)
     x = torch.tensor([[-0.95, 3.9]], dtype=torch.float64)
     rest = torch.zeros(1, 2, dtype=torch.float64)

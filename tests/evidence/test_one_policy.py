@@ -11,16 +11,13 @@ from helpers.learning.features import discounts, tracking_reward
 from helpers.learning.tracking_policy import TrackingPID
 from helpers.plant.rollout import stream
 from helpers.plant.tracking import track
-from helpers.runs.session import open_session
 
 MARGIN, LOAD = 0.4, 0.05
 
 
 @pytest.fixture(scope="module")
-def ground(root, tmp_path_factory):
-    folder = str(tmp_path_factory.mktemp("one_policy"))
-    given = {"seed": 0, "scale": "smoke", "input_root": folder, "output_root": folder, "params_root": str(root)}
-    return one_policy.enter(open_session("09_one_policy", given))
+def ground(opened):
+    return one_policy.enter(opened("09_one_policy"))
 
 
 def test_the_range_of_set_points_holds_every_case_and_the_grid(ground):

@@ -15,6 +15,7 @@ from helpers.report import search_report
 from helpers.runs.artifacts import load_stage
 from helpers.settings.paper import load_published
 from helpers.settings.search import RangeParams, load_search
+from tests.plant.test_rollout import CALM
 
 
 @pytest.fixture
@@ -102,7 +103,7 @@ def test_the_command_writes_every_trial_and_the_weights_and_the_report_draws_the
 
 def test_relearning_meets_the_closed_loop_of_the_policy_and_climbs(search):
     study, n = search.study(1, 0), 3
-    quiet = study.varied(process={"disturbance": (0.0, 0.0), "observation_noise": (0.0, 0.0)}, case={"initial_std": (0.0, 0.0)})
+    quiet = study.varied(process=CALM, case={"initial_std": (0.0, 0.0)})
     policy = study.fresh_policy()
     stacked = {name: value.expand(n, *value.shape) for name, value in policy.named_parameters()}
     found, expected = weights_set.closed_loops(policy, stacked, quiet, 2, stream(0)), quiet.fresh(policy, 1)

@@ -1,7 +1,5 @@
 """Algorithm 1: returns, baselines, the policy gradient against exact integration, and the learner's book-keeping."""
 
-import copy
-from contextlib import suppress
 from functools import partial
 
 import numpy as np
@@ -24,6 +22,7 @@ from helpers.learning.learner import (
 from helpers.learning.policy import PolicyController
 from helpers.plant.process import LinearProcess
 from helpers.plant.rollout import rollout, stream
+from tests.plant.test_rollout import CALM
 
 F64 = torch.float64
 
@@ -32,14 +31,16 @@ def normal(*shape, seed=0):
     return torch.randn(*shape, generator=stream(seed, "test", *shape), dtype=F64)
 
 
+def differences(function, at, step=1e-6):
+    """Central differences of a scalar function."""
+    return np.array([(function(at + row) - function(at - row)) / (2 * step) for row in step * np.eye(len(at))])
+
+
 @pytest.fixture(scope="module")
 def settings(study):
     """Learner parameters of the printed variant, with changes."""
     base = study().params.learning.variants["printed"].learner
     return lambda **changes: base.model_copy(update={"patience": 0, **changes})
-
-
-# Returns and baselines
 
 
 @pytest.mark.equation("3.1.5")
@@ -68,21 +69,6 @@ def test_regression_advantage_is_the_residual_of_ridge_regression():
         np.testing.assert_allclose(found[t], future[t] - design @ fit, rtol=1e-9, atol=1e-10)
 
 
-def test_the_baseline_looks_at_nothing_later_than_the_observation(study):
-    case = study()
-    batch = rollout(case.process, case.pid, case.task, 5, stream(0))
-    late = copy.deepcopy(batch)
-    late.y[21:] += 1
-    late.u[20:] += 1
-    late.command[20:] += 1
-    before, after = baseline_regressors(batch, case.features), baseline_regressors(late, case.features)
-    assert torch.equal(before[:21], after[:21])
-    assert not torch.equal(before[21:], after[21:])
-
-
-# The policy gradient by exact integration: two steps, one input, no other randomness
-
-
 class Grid(PolicyController):
     """A policy whose exploration runs over the nodes of a quadrature instead of being drawn."""
 
@@ -97,15 +83,16 @@ class Grid(PolicyController):
 
 
 class Integral:
-    """J(theta) = E[G] of a two-step problem by Gauss-Hermite quadrature over both exploration draws.
+    """J(theta) = E[G] of two steps of one input by Gauss-Hermite quadrature over both draws; nothing else is random.
 
     The leaky ReLU is made linear, so that the integrand is smooth and the quadrature exact to rounding.
     """
 
     gamma = 0.9
 
-    def __init__(self, synthetic):
-        case = synthetic(1, 1, n_steps=2, noise=0.0)
+    def __init__(self, study):
+        one_input = {"manipulated": ("u",), "drift_input": ((4.0,), (1.0,)), "input_low": (-4.0,), "input_high": (6.0,)}
+        case = study(process=CALM | one_input | {"horizon": 2}, case_study={"initial_std": (0.0, 0.0)})
         self.task, self.features, self.process = case.task, case.features, case.process
         self.policy = case.policy(hidden_cells=(3, 2), leaky_slope=1.0)
         with torch.no_grad():  # the spread and its gradient should depend on the history too
@@ -114,37 +101,28 @@ class Integral:
         first, second = np.meshgrid(nodes, nodes, indexing="ij")
         self.nodes = torch.tensor(np.stack([first.ravel(), second.ravel()])[..., None])
         self.weights = torch.tensor(np.outer(weights, weights).ravel() / weights.sum() ** 2)
-        self.exact = self.finite_differences()
+        self.theta = parameters_to_vector(self.policy.parameters()).detach()
+        self.exact = differences(self.value, self.theta.numpy(), 1e-4)
 
-    def batch(self):
+    def batch(self, theta):
+        vector_to_parameters(torch.as_tensor(theta), self.policy.parameters())
         return rollout(self.process, Grid(self.policy, self.task, self.nodes), self.task, len(self.weights), stream(0))
 
     def rewards(self, batch):
         return torch.cos(3 * batch.x[1:, :, 0]) + batch.x[1:, :, 0] ** 3
 
-    def value(self):
-        rewards = self.rewards(self.batch())
+    def value(self, theta):
+        rewards = self.rewards(self.batch(theta))
         return (self.weights @ (rewards[0] + self.gamma * rewards[1])).item()
 
     def gradient(self, advantage, objective):
         """The exact expectation of the estimator: each trajectory counts by its probability, not by 1/K."""
-        batch = self.batch()
+        batch = self.batch(self.theta)
         log_probability = self.policy.log_probability(batch.y, batch.u, batch.command, self.task)
         weighted = advantage(self.rewards(batch), batch) * self.weights * len(self.weights)
         self.policy.zero_grad()
         objective(log_probability, weighted).backward()
         return parameters_to_vector([parameter.grad for parameter in self.policy.parameters()]).numpy()
-
-    def finite_differences(self, step=1e-4):
-        start = parameters_to_vector(self.policy.parameters()).detach()
-
-        def value(at):
-            vector_to_parameters(at, self.policy.parameters())
-            return self.value()
-
-        found = [(value(start + row) - value(start - row)) / (2 * step) for row in step * torch.eye(len(start), dtype=F64)]
-        vector_to_parameters(start, self.policy.parameters())
-        return np.array(found)
 
 
 ADVANTAGES = {
@@ -162,37 +140,32 @@ OBJECTIVES = {
 
 
 @pytest.fixture(scope="module")
-def problem(synthetic):
-    return Integral(synthetic)
+def problem(study):
+    return Integral(study)
 
 
-@pytest.mark.equation("3.2.1")
-@pytest.mark.equation("3.2.4")
+@pytest.mark.equation("3.2.1", "3.2.4")
 @pytest.mark.parametrize("objective", OBJECTIVES)
 @pytest.mark.parametrize("name", ADVANTAGES)
 def test_the_surrogates_gradient_is_that_of_the_expected_return_whatever_the_baseline(problem, name, objective):
-    """The clipped one where the batch was drawn."""
+    """The clipped one where the batch was drawn. A baseline that looked at the present input or later ones would move it."""
     found = problem.gradient(partial(ADVANTAGES[name], problem), OBJECTIVES[objective])
     assert np.abs(problem.exact).max() > 0.05
     np.testing.assert_allclose(found, problem.exact, rtol=1e-5, atol=1e-7)
 
 
-# The learner
-
-
-def closeness_reward(case, beta=1.0):
-    return lambda batch: case.features.tracking(batch, beta)
+def closeness_reward(case):
+    return lambda batch: case.features.tracking(batch, 1.0)
 
 
 @pytest.mark.equation("3.2.2")
-@pytest.mark.parametrize(("passes", "minibatches"), [(1, 1), (2, 1), (1, 3), (2, 2)])
-def test_the_steps_of_an_epoch_against_plain_autograd(study, settings, passes, minibatches):
+@pytest.mark.parametrize(("n", "passes", "minibatches"), [(12, 1, 1), (12, 2, 1), (12, 1, 3), (200, 2, 2)])
+def test_the_steps_of_an_epoch_against_plain_autograd(case, settings, n, passes, minibatches):
     """Each is taken by Adam from the policy that the one before it left, along the clipped ratio of what the first one drew."""
-    case = study()
     reference, reward, task = case.policy(), closeness_reward(case), case.task
     changes = {"learning_rate_start": 1e-2, "credit": "whole_return", "averaging": 0.0, "ratio_clip": 0.05}
-    learner = case.learner(case.policy(), 12, 2, settings(passes=passes, minibatches=minibatches, **changes))
-    batch = rollout(case.process, PolicyController(reference, task, True), task, 12, stream(0, "learner"))
+    learner = case.learner(case.policy(), n, 2, settings(passes=passes, minibatches=minibatches, **changes))
+    batch = rollout(case.process, PolicyController(reference, task, True), task, n, stream(0, "learner"))
     advantage = whole_return_advantage(reward(batch), 0.99)
     advantage = advantage / advantage.std()
     optimiser = torch.optim.Adam(reference.parameters(), lr=1e-2)
@@ -202,7 +175,7 @@ def test_the_steps_of_an_epoch_against_plain_autograd(study, settings, passes, m
 
     drawn = log_probability().detach()
     for step in range(passes * minibatches):
-        rows = torch.arange(12).chunk(minibatches)[step % minibatches]
+        rows = torch.arange(n).chunk(minibatches)[step % minibatches]
         ratio = (log_probability() - drawn).exp()
         gain = torch.minimum(ratio * advantage, ratio.clamp(0.95, 1.05) * advantage)[:, rows].sum(0).mean()
         optimiser.zero_grad()
@@ -211,11 +184,10 @@ def test_the_steps_of_an_epoch_against_plain_autograd(study, settings, passes, m
     algorithm_1(learner, reward, 1)
     for value, expected in zip(learner.policy.parameters(), reference.parameters(), strict=True):
         torch.testing.assert_close(value.detach(), expected.detach(), rtol=1e-6, atol=1e-7)
-    assert (learner.epochs, learner.episodes, learner.gradient_steps) == (1, 12, passes * minibatches)
+    assert (learner.epochs, learner.episodes, learner.gradient_steps) == (1, n, passes * minibatches)
 
 
-def test_the_record_of_an_epoch_is_that_of_its_batch(study, settings):
-    case = study()
+def test_the_record_of_an_epoch_is_that_of_its_batch(case, settings):
     policy = case.policy()
     batch = rollout(case.process, PolicyController(policy, case.task, True), case.task, 20, stream(0, "learner"))
     returns = discounted_return(closeness_reward(case)(batch), 0.99)
@@ -225,18 +197,16 @@ def test_the_record_of_an_epoch_is_that_of_its_batch(study, settings):
     assert record.policy_std == pytest.approx(policy.params.initial_std, rel=0.2)  # in units of the input range, after one step
 
 
-def test_the_learning_rate_falls_along_half_a_cosine(study, settings):
+def test_the_learning_rate_falls_along_half_a_cosine(case, settings):
     assert [annealed(3.0, 1.0, progress) for progress in (0.0, 0.5, 1.0)] == pytest.approx([3.0, 2.0, 1.0], rel=1e-14)
-    case = study()
     learner = case.learner(case.policy(), 4, 5, settings(learning_rate_start=4e-3, learning_rate_end=1e-3))
     rates = [record.learning_rate for record in algorithm_1(learner, closeness_reward(case), 5)]
     assert rates == pytest.approx([annealed(4e-3, 1e-3, epoch / 4) for epoch in range(5)])
 
 
 @pytest.mark.parametrize("averaging", [0.0, 0.5, 0.9])
-def test_the_average_is_a_running_mean_of_the_weights(study, settings, averaging):
+def test_the_average_is_a_running_mean_of_the_weights(case, settings, averaging):
     """After n epochs the old average counts n / (n + 9), but not more than `averaging`; without it the last policy is kept."""
-    case = study()
     learner = case.learner(case.policy(), 8, 6, settings(averaging=averaging))
     expected = learner.policy.output.bias.detach().clone()
     for n in range(1, 7):
@@ -244,18 +214,6 @@ def test_the_average_is_a_running_mean_of_the_weights(study, settings, averaging
         keep = min(averaging, n / (n + 9))
         expected = keep * expected + (1 - keep) * learner.policy.output.bias.detach()
     torch.testing.assert_close(learner.average.output.bias.detach(), expected, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("variant", ["improved", "printed"])
-def test_a_few_epochs_raise_the_return_on_an_easy_task(study, variant):
-    """Closeness with a wide basin, from a policy that holds the inputs near zero; the usual gain is 44."""
-    case = study(1, torch.float32)
-    params = case.params.learning.variants[variant].learner.model_copy(
-        update={"learning_rate_start": 1e-2, "learning_rate_end": 1e-2, "patience": 0}
-    )
-    learner = case.learner(case.policy(), 100, 25, params)
-    returns = [record.mean_return for record in algorithm_1(learner, closeness_reward(case, 1.0), 25)]
-    assert np.mean(returns[-3:]) > returns[0] + 20
 
 
 @pytest.mark.parametrize("minibatches", [1, 2])
@@ -267,9 +225,6 @@ def test_an_entropy_bonus_keeps_exploration_up(study, settings, minibatches):
         return algorithm_1(case.learner(case.policy(), 20, 8, params), closeness_reward(case), 8)[-1].policy_std
 
     assert spread(1.0) > spread(0.0) + 0.003
-
-
-# Early stopping
 
 
 def scripted(levels):
@@ -293,14 +248,10 @@ def scripted(levels):
         ([3, 1, 2, 2.5, 4, 5], 3, 4),  # better than the last is not better than the best
     ],
 )
-def test_early_stopping_by_patience(study, settings, levels, patience, expected):
-    case = study()
+def test_early_stopping_by_patience(case, settings, levels, patience, expected):
     learner = case.learner(case.policy(), 4, 6, settings())
     records = algorithm_1(learner, scripted(levels), 6, patience)
     assert len(records) == learner.epochs == expected
-
-
-# Training that cannot go on
 
 
 class Failing(LinearProcess):
@@ -313,8 +264,7 @@ class Failing(LinearProcess):
         return super().step(x, u, noise) * (1.0 if self.steps >= 0 else float("nan"))
 
 
-def test_a_process_that_returns_nan_ends_training_with_the_epoch(study, settings):
-    case = study()
+def test_a_process_that_returns_nan_ends_training_with_the_epoch(case, settings):
     learner = case.learner(case.policy(), 4, 5, settings())
     learner.process = Failing(case.params.process, F64)
     with pytest.raises(TrainingError, match=r"epoch 2: .*not finite"):
@@ -324,8 +274,7 @@ def test_a_process_that_returns_nan_ends_training_with_the_epoch(study, settings
 
 
 @pytest.mark.parametrize("minibatches", [1, 3])
-def test_a_gradient_that_is_not_finite_ends_training_before_the_step(study, settings, minibatches):
-    case = study()
+def test_a_gradient_that_is_not_finite_ends_training_before_the_step(case, settings, minibatches):
     policy = case.policy()
     before = policy.output.weight.detach().clone()
     policy.output.bias.register_hook(lambda gradient: gradient * float("inf"))
@@ -334,19 +283,9 @@ def test_a_gradient_that_is_not_finite_ends_training_before_the_step(study, sett
     assert torch.equal(policy.output.weight, before)
 
 
-@pytest.mark.parametrize("rate", [1e3, 1e30])
-def test_an_absurd_learning_rate_gives_numbers_or_the_epoch(study, settings, rate):
-    """ReLU6 and the gates saturate, so most such rates give a useless policy, not NaN; none may end in another error."""
-    case = study(1, torch.float32)
-    learner = case.learner(case.policy(), 4, 3, settings(learning_rate_start=rate, learning_rate_end=rate))
-    with suppress(TrainingError):
-        assert np.isfinite([record.mean_return for record in algorithm_1(learner, closeness_reward(case), 3)]).all()
-
-
 @pytest.mark.parametrize("credit", ["whole_return", "reward_to_go"])
-def test_a_reward_without_spread_ends_training_with_the_cause(study, settings, credit):
+def test_a_reward_without_spread_ends_training_with_the_cause(case, settings, credit):
     """Nothing to learn from: the cause is the reward, not the learning rate."""
-    case = study()
     learner = case.learner(case.policy(), 4, 5, settings(credit=credit))
     with pytest.raises(TrainingError, match=r"epoch 1: .*(reward|return)"):
         algorithm_1(learner, lambda batch: torch.zeros(batch.n_steps, batch.n_trajectories, dtype=F64), 1)

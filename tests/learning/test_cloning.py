@@ -20,13 +20,11 @@ def params(root, study):
 
 
 @pytest.fixture
-def demonstrations(study):
-    case = study()
+def demonstrations(case):
     return rollout(case.process, case.pid, case.task, 12, stream(0, "demonstrations"))
 
 
-def test_loss_of_a_policy_that_always_gives_the_same_input(study, demonstrations):
-    case = study()
+def test_loss_of_a_policy_that_always_gives_the_same_input(case, demonstrations):
     policy = case.policy()
     with torch.no_grad():
         policy.output.weight.zero_()
@@ -39,8 +37,7 @@ def test_loss_of_a_policy_that_always_gives_the_same_input(study, demonstrations
     assert cloning_loss(policy, demonstrations, rows, case.task).item() == pytest.approx(expected, rel=1e-12)
 
 
-def test_cloning_learns_and_repeats(study, demonstrations, params):
-    case = study()
+def test_cloning_learns_and_repeats(case, demonstrations, params):
     held = torch.arange(10, 12)  # a fifth of twelve, rounded
     before = cloning_loss(case.policy(), demonstrations, held, case.task).item()
     runs = [clone(case.policy(), demonstrations, case.task, params, 75, stream(1)) for _ in range(2)]
@@ -49,8 +46,7 @@ def test_cloning_learns_and_repeats(study, demonstrations, params):
     assert cloning_loss(runs[0].policy, demonstrations, held, case.task).item() == pytest.approx(runs[0].loss, rel=1e-12)
 
 
-def test_what_is_held_back_is_not_learned_from(study, demonstrations, params):
-    case = study()
+def test_what_is_held_back_is_not_learned_from(case, demonstrations, params):
     spoilt = copy.deepcopy(demonstrations)
     spoilt.u[:, 10:] = -spoilt.u[:, 10:]
     once = params.model_copy(update={"check_every": 6})  # only the last step is looked at
@@ -59,16 +55,14 @@ def test_what_is_held_back_is_not_learned_from(study, demonstrations, params):
     assert found[0].loss != found[1].loss
 
 
-def test_the_step_with_the_least_loss_is_kept(study, demonstrations, params):
-    case = study()
+def test_the_step_with_the_least_loss_is_kept(case, demonstrations, params):
     wild = params.model_copy(update={"learning_rate_start": 0.5, "learning_rate_end": 0.5, "check_every": 1})
     found = clone(case.policy(), demonstrations, case.task, wild, 12, stream(1))
     assert found.chosen_step < 12
     assert clone(case.policy(), demonstrations, case.task, wild, found.chosen_step, stream(1)).loss == found.loss
 
 
-def test_refusals(study, demonstrations, params):
-    case = study()
+def test_refusals(case, demonstrations, params):
     single = replace(demonstrations, **{name: signal[:, :1] for name, signal in vars(demonstrations).items()})
     with pytest.raises(TrainingError, match="two demonstrations or more, one of them to validate on, found 1"):
         clone(case.policy(), single, case.task, params, 1, stream(1))

@@ -42,8 +42,7 @@ def test_the_critic_leads_the_policy_where_few_returns_do_not(study):
     assert reached(1.0) > 1.2 * reached(0.0)
 
 
-def test_without_a_tracking_reward_the_critic_is_silent(study):
-    case = study(1)
+def test_without_a_tracking_reward_the_critic_is_silent(case):
     params = case.params.learning.online.learner.model_copy(update={"critic": 1.0})
     learner = case.learner(case.policy(), 5, 1, params)
     algorithm_1(learner, partial(case.features.tracking, beta=3.0), 1)

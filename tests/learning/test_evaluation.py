@@ -15,8 +15,7 @@ F64 = torch.float64
 
 
 @pytest.mark.equation("S1")
-def test_features_are_means_over_fresh_episodes_and_scores_hold_their_deviations_too(study):
-    case = study()
+def test_features_are_means_over_fresh_episodes_and_scores_hold_their_deviations_too(case):
     batch = rollout(case.process, case.pid, case.task, 30, stream(0, "evaluation"))
     v = case.features.trajectory(batch).numpy()
     expected = expected_features(case.process, case.pid, case.features, 30, stream(0, "evaluation"))
@@ -44,8 +43,7 @@ def test_feature_gap_of_the_published_rows(root, case, gap):
 
 @pytest.mark.equation("5.1.2.1")
 @pytest.mark.parametrize("beta", [10.0, 30.0])
-def test_objective_by_plain_loops(study, beta):
-    case = study()
+def test_objective_by_plain_loops(case, beta):
     batch = rollout(case.process, case.pid, case.task, 3, stream(0, "objective"))
     for k, found in enumerate(objective(batch, case.features, beta)):
         total = 0.0

@@ -29,10 +29,7 @@ def test_accumulated_error_tends_to_the_integral():
     assert gaps[:-1] / gaps[1:] == pytest.approx([2, 2], rel=0.05)
 
 
-@pytest.mark.equation("3.3.1")
-@pytest.mark.equation("4.2.2")
-@pytest.mark.equation("4.2.4")
-@pytest.mark.equation("4.2.5")
+@pytest.mark.equation("3.3.1", "4.2.2", "4.2.4", "4.2.5")
 def test_reward_is_the_weighted_sum_in_the_order_of_the_paper():
     errors = 0.3 * torch.randn(9, 4, 2, generator=stream(0, "errors"), dtype=F64)
     alpha = [0.137, 0.652, -0.067, -0.630, -0.194, -0.343]
@@ -48,8 +45,7 @@ def test_reward_is_the_weighted_sum_in_the_order_of_the_paper():
             before = size
 
 
-@pytest.mark.equation("3.3.4")
-@pytest.mark.equation("3.3.6")
+@pytest.mark.equation("3.3.4", "3.3.6")
 @pytest.mark.parametrize("gamma", [1.0, 0.5])
 def test_trajectory_features_and_their_weighted_sum_by_plain_loops(gamma):
     phi, alpha = (torch.randn(*shape, generator=stream(0, "phi"), dtype=F64) for shape in ((7, 3, 5), (5,)))
@@ -61,8 +57,7 @@ def test_trajectory_features_and_their_weighted_sum_by_plain_loops(gamma):
 
 @pytest.mark.equation("5.1.2.1")
 @pytest.mark.parametrize("signal", ["x", "y"])
-def test_the_features_look_at_samples_1_to_t_of_the_chosen_signal(study, signal):
-    case = study()
+def test_the_features_look_at_samples_1_to_t_of_the_chosen_signal(case, signal):
     features = type(case.features)(case.features.params.model_copy(update={"features_on": signal}), case.task, 0.04)
     batch = rollout(case.process, case.pid, case.task, 3, stream(0, "rollout"))
     errors = (case.task.set_point - getattr(batch, signal)[1:]) / case.task.set_point  # the steady state is the origin

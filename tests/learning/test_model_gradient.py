@@ -1,6 +1,4 @@
-"""The gradient through the model against finite differences and against what REINFORCE expects; the price on movement."""
-
-from dataclasses import replace
+"""The gradient through the model against finite differences; the price on movement."""
 
 import numpy as np
 import pytest
@@ -15,11 +13,6 @@ from helpers.plant.tracking import Scenarios, track
 from tests.learning.test_tracking_policy import bounds, episodes, fresh
 
 ONE = Descent(steps=1, longest=torch.inf, price=0.0, price_step=0.0)
-
-
-@pytest.fixture
-def case(study):
-    return study()
 
 
 def start(case, n, n_steps, set_point=(-0.2, 0.5), **changes):
@@ -48,29 +41,6 @@ def test_the_gradient_is_that_of_finite_differences(case):
             with torch.no_grad():
                 costs.append(squared(drawn, track(policy, drawn, bounds(case)))[0].mean().item())
         np.testing.assert_allclose((costs[0] - costs[1]) / 2e-6, (gradient @ way).item(), rtol=1e-5, atol=1e-9)
-
-
-@pytest.mark.equation("3.2.4")
-def test_reinforce_expects_the_same_gradient(case):
-    """One step with the input drawn about the policy's, u ~ N(mu, sigma^2): E[cost grad ln pi] against that through the model.
-
-    The draw of the input is the load, which the process adds to the policy's mean.
-    """
-    n, sigma = 40_000, 1.5
-    noise = torch.randn(1, n, 2, generator=stream(0, "exploration"), dtype=case.dtype)
-    policy, drawn = start(case, n, 1, load=sigma * noise)
-    drawn = replace(drawn, start=torch.full((n, 2), 0.1, dtype=case.dtype))
-    half = (policy.high - policy.low) / 2  # d mu / d bias of the output layer
-    with torch.no_grad():
-        run = track(policy, drawn, bounds(case))
-        cost = squared(drawn, run)[0]
-    assert ((run.u > policy.low) & (run.u < policy.high)).all()
-    samples = (cost - cost.mean())[:, None] * noise[0] / sigma * half
-    model_gradient(policy, lambda: drawn, squared, bounds(case), ONE)
-    error = (samples.mean(0) - policy.output.bias.grad).abs()
-    spread = samples.std(0) / n**0.5
-    assert (error < 5 * spread).all()
-    assert (policy.output.bias.grad.abs() > 10 * spread).all(), "the test could not tell it from zero"
 
 
 def test_the_price_on_movement_rises_while_there_is_too_much_and_falls_after(case):

@@ -59,22 +59,11 @@ def episodes(case, policy, exploring=True, n=7, seed=0):
 
 
 @pytest.mark.equation("3.2.5")
-def test_the_output_layer_is_relu6_mapped_to_the_bounds(study):
-    case = study()
-    policy, task = case.policy(std_low=0.1, initial_std=0.2, std_high=0.7), case.task
-    z = torch.linspace(-4, 10, 57, dtype=F64)[:, None].repeat(1, 4)
-    mean, std = (part.detach().numpy() for part in policy.scaling(task).outputs(z))
-    relu6 = np.minimum(np.maximum(0, z.numpy()), 6)[:, :2]
-    low, span = task.input_low.numpy(), (task.input_high - task.input_low).numpy()
-    np.testing.assert_allclose(mean, low + span * relu6 / 6, rtol=1e-13, atol=1e-13)
-    np.testing.assert_allclose(std, span * (0.1 + 0.6 * relu6 / 6), rtol=1e-13)
-
-
 @pytest.mark.parametrize("hidden_cells", [(20, 20), (3,), (4, 7, 2)], ids=str)
 @pytest.mark.parametrize("leaky_slope", [0.01, 0.3])
-def test_forward_is_the_textbook_lstm_with_leaky_relu_on_each_output(study, hidden_cells, leaky_slope):
-    case = study()
-    policy = stirred(case.policy(hidden_cells=hidden_cells, leaky_slope=leaky_slope))
+def test_forward_is_the_textbook_lstm_with_leaky_relu_and_relu6_mapped_to_the_bounds(case, hidden_cells, leaky_slope):
+    spread = {"std_low": 0.1, "initial_std": 0.2, "std_high": 0.7}
+    policy = stirred(case.policy(hidden_cells=hidden_cells, leaky_slope=leaky_slope, **spread))
     batch = episodes(case, policy)
     mean, std = policy(batch.y, batch.u, case.task)
     expected = numpy_forward(policy, batch.y, batch.u, case.task)
@@ -99,8 +88,7 @@ def test_fast_stepping_agrees_with_forward_along_whole_trajectories(study, dtype
     assert ((command - expected) / span).abs().max() < tolerance
 
 
-def test_exploration_is_standard_normal(study):
-    case = study()
+def test_exploration_is_standard_normal(case):
     memory = PolicyController(case.policy(), case.task, exploring=True).start(40_000, 1, stream(0, "spread"))
     draws = torch.stack(memory.exploration).numpy()
     np.testing.assert_array_less(np.abs(draws.mean(-1)), 5 / np.sqrt(40_000))
@@ -115,28 +103,18 @@ def test_entropy_is_that_of_inputs_measured_by_their_range(study):
 
 
 @pytest.mark.equation("3.2.3")
-def test_log_probability_and_its_gradient_are_those_of_independent_normal_inputs(study):
-    """Written with scipy, the gradient by finite differences; the rest of a trajectory's density does not depend on the policy."""
-    case = study()
-    policy = case.policy(leaky_slope=0.3)
+def test_log_probability_and_its_gradient_are_those_of_independent_normal_inputs(case):
+    """Of scipy, and torch's own gradient through its own LSTM; the rest of a trajectory's density does not depend on the policy."""
+    policy = stirred(case.policy(leaky_slope=0.3))
     batch = episodes(case, policy)
-
-    def log_density():
-        mean, std = numpy_forward(policy, batch.y, batch.u, case.task)
-        return norm.logpdf(batch.command.numpy(), mean, std).sum(-1)
-
     found = policy.log_probability(batch.y, batch.u, batch.command, case.task)
-    np.testing.assert_allclose(found.detach(), log_density(), rtol=0, atol=1e-9)
-    found.sum().backward()
-    for parameter in policy.parameters():
-        values, gradient = parameter.detach().view(-1), parameter.grad.view(-1)
-        for index in (0, len(values) // 2, int(gradient.abs().argmax())):
-            middle, sides = values[index].item(), []
-            for shift in (1e-5, -1e-5):
-                values[index] = middle + shift
-                sides.append(log_density().sum())
-            values[index] = middle
-            assert (sides[0] - sides[1]) / 2e-5 == pytest.approx(gradient[index].item(), rel=1e-4, abs=1e-4)
+    mean, std = numpy_forward(policy, batch.y, batch.u, case.task)
+    np.testing.assert_allclose(found.detach(), norm.logpdf(batch.command.numpy(), mean, std).sum(-1), rtol=0, atol=1e-9)
+    weights = torch.randn(found.shape, generator=stream(0), dtype=F64)
+    expected = torch.distributions.Normal(*policy(batch.y, batch.u, case.task)).log_prob(batch.command).sum(-1)
+    gradients = [torch.autograd.grad((weights * values).sum(), list(policy.parameters())) for values in (found, expected)]
+    for own, torchs in zip(*gradients, strict=True):
+        torch.testing.assert_close(own, torchs, rtol=1e-8, atol=1e-8 * torchs.abs().max().item())
 
 
 @pytest.mark.parametrize(("low", "high"), [((-20.0, -60.0), (20.0, 60.0)), ((-1.0, -5.0), (9.0, 95.0))])
@@ -156,9 +134,8 @@ def test_a_fresh_policy_asks_for_inputs_near_the_steady_state(study, low, high):
 
 
 @pytest.mark.parametrize("limits", [None, {"std_low": 0.1, "std_high": 0.9, "initial_std": 0.3}])
-def test_reset_exploration_restores_the_spread_and_keeps_the_mean(study, limits):
+def test_reset_exploration_restores_the_spread_and_keeps_the_mean(case, limits):
     """Within the limits of the policy, or within new ones that it takes over."""
-    case = study()
     policy = stirred(case.policy())
     batch = episodes(case, policy)
     before = policy(batch.y, batch.u, case.task)

@@ -10,8 +10,8 @@ from helpers.plant.controllers import PID
 from helpers.plant.rollout import rollout, stream
 from helpers.plant.tracking import AtSetPoint, Bounds, Scenarios, track
 from helpers.settings.paper import GainParams
+from tests.plant.test_rollout import CALM
 
-CALM = {"disturbance": (0.0, 0.0), "observation_noise": (0.0, 0.0)}
 PARTS = ([20.0, 25.0], [1.0, 6.0], [0.0, 0.5])
 
 
@@ -22,13 +22,6 @@ def case(study):
 
 def gains(parts=PARTS):
     return Gains(*(torch.tensor(values, dtype=torch.float64).diag() for values in parts))
-
-
-def paper_pid(case, parts):
-    """The paper's PID with the same gains, without derivative action."""
-    dt = case.params.process.sampling_time
-    integral = tuple(value / dt for value in parts[1])
-    return PID(GainParams.model_construct(proportional=parts[0], integral=integral, derivative=parts[2]), case.task.set_point, dt)
 
 
 def bounds(case):
@@ -71,9 +64,11 @@ def test_with_an_output_layer_of_zero_it_is_the_pid(study):
 def test_where_nothing_is_cut_off_or_all_of_it_kept_it_is_the_pid_of_the_paper(study):
     """Which goes on integrating at a bound. Without derivative action: at the first sample the paper's PID has none."""
     case, wide, parts = study(), study(process={"input_low": (-1e4, -1e4), "input_high": (1e4, 1e4)}), (*PARTS[:2], [0.0, 0.0])
-    patient = fresh(case, kept=1 - 1e-13, parts=parts)
+    patient, dt = fresh(case, kept=1 - 1e-13, parts=parts), case.params.process.sampling_time
+    same = {"proportional": parts[0], "integral": [value / dt for value in parts[1]], "derivative": parts[2]}
+    paper = PID(GainParams.model_construct(**same), case.task.set_point, dt)
     for each, tracker, tolerance in ((wide, tracking_pid(wide, parts), 1e-9), (case, patient, 1e-7)):
-        controllers = AtSetPoint(tracker, each.task), paper_pid(each, parts)
+        controllers = AtSetPoint(tracker, each.task), paper
         with torch.no_grad():
             runs = [rollout(each.process, controller, each.task, 4, stream(0, "episodes")).u for controller in controllers]
         torch.testing.assert_close(*runs, rtol=tolerance, atol=tolerance)

@@ -82,35 +82,3 @@ def refusal(action, *arguments, **changes):
     assert re.search(r"plant\.\w+: ", sentence)
     assert "\n" not in sentence
     return sentence
-
-
-class Loop:
-    """A loop or several under PI control, with dead times, recorded; deviation variables. `stretch` is a record of it.
-
-    Args:
-        channels: of each output and input numerator and denominator in q^-1 (first entries for q^0, the held input counts from the
-            next sample on) and dead time. gains: P and I per sample of each loop.
-    """
-
-    def __init__(self, channels, gains, noise=0.02, seed=0):
-        self.channels, self.gains, self.noise = channels, np.asarray(gains, dtype=float), noise
-        self.rng = np.random.default_rng(seed)
-
-    def record(self, n_samples=2400, hold=60, size=5.0):
-        n_y, n_u = len(self.channels), len(self.channels[0])
-        y, u, parts = np.zeros((n_samples, n_y)), np.zeros((n_samples + 1, n_u)), np.zeros((n_samples, n_y, n_u))
-        set_points = self.rng.uniform(-size, size, (n_samples // hold + 1, len(self.gains)))
-        error = np.zeros((n_samples + 1, len(self.gains)))
-        disturbance = 0.0
-        for t in range(n_samples):
-            for i, row in enumerate(self.channels):
-                for j, (b, a, dead) in enumerate(row):
-                    past = sum(value * (u[t - k - dead, j] if t - k - dead >= 0 else 0) for k, value in enumerate(b))
-                    parts[t, i, j] = past + sum(-value * (parts[t - k, i, j] if t >= k else 0) for k, value in enumerate(a[1:], 1))
-            disturbance = 0.9 * disturbance + self.noise * self.rng.normal()
-            y[t] = parts[t].sum(1) + disturbance + self.noise * self.rng.normal(size=n_y)
-            error[t] = set_points[t // hold] - y[t, : len(self.gains)]
-            change = error[t] - (error[t - 1] if t else 0)
-            u[t + 1] = u[t]
-            u[t + 1, : len(self.gains)] += self.gains[:, 0] * change + self.gains[:, 1] * error[t]
-        return y, u[1:]

@@ -149,13 +149,6 @@ def test_without_any_set_point_the_inputs_stay_held(description):
     assert np.array(inputs) == pytest.approx(np.tile([20.0, 21.0], (len(inputs), 1)))
 
 
-def noted(description):
-    """The notes of a policy's file."""
-    keys = {"name", "tag", "unit", "low", "high", "steady_state"}
-    notes = {"title": description.title, "sampling_time": [description.sampling_time, description.time_unit]}
-    return notes | {k: [v.model_dump(include=keys) for v in getattr(description, k)] for k in ("controlled", "manipulated")}
-
-
 def first(**changes):
     """The first manipulated variable changed."""
     return lambda d: {"manipulated": (d.manipulated[0].model_copy(update=changes), d.manipulated[1])}
@@ -174,7 +167,9 @@ def first(**changes):
     ],
 )
 def test_a_policy_under_a_description_that_is_not_its_own_is_refused(description, change, says):
-    policy = Asking(**noted(description))
+    keys = {"name", "tag", "unit", "low", "high", "steady_state"}
+    notes = {k: [v.model_dump(include=keys) for v in getattr(description, k)] for k in ("controlled", "manipulated")}
+    policy = Asking(title=description.title, sampling_time=[description.sampling_time, description.time_unit], **notes)
     Guard(policy, description.model_copy(update={"time_unit": "min", "sampling_time": 2 / 60}))  # the same time
     with pytest.raises(InputError, match=re.escape(says)):
         Guard(policy, description.model_copy(update=change(description)))

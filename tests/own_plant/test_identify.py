@@ -9,7 +9,6 @@ from helpers.own_plant.episodes import Stretch
 from helpers.own_plant.identify import Equation, Margins, Structure, apart, assemble, hold_out
 from helpers.own_plant.settings import load_own_plant
 from helpers.settings.leaf import InputError
-from tests.own_plant.plants import Loop
 
 FIRST = ([0.2], [1.0, -0.9])  # gain 2
 
@@ -20,6 +19,30 @@ def params(root):
     return load_own_plant(root).identification.model_copy(update=quick)
 
 
+def record(channels, gains, n_samples=2400, hold=60):
+    """A stretch of loops under PI control with dead times; deviation variables.
+
+    Args:
+        channels: of each output and input numerator and denominator in q^-1 (first entries for q^0, the held input counts from the
+            next sample on) and dead time. gains: P and I per sample of each loop.
+    """
+    rng, gains, n_y, n_u, n_loops = np.random.default_rng(0), np.array(gains), len(channels), len(channels[0]), len(gains)
+    y, u, parts = np.zeros((n_samples, n_y)), np.zeros((n_samples + 1, n_u)), np.zeros((n_samples, n_y, n_u))
+    set_points, error = rng.uniform(-5, 5, (n_samples // hold + 1, n_loops)), np.zeros((n_samples + 1, n_loops))
+    disturbance = 0.0
+    for t in range(n_samples):
+        for i, row in enumerate(channels):
+            for j, (b, a, dead) in enumerate(row):
+                past = sum(value * (u[t - k - dead, j] if t - k - dead >= 0 else 0) for k, value in enumerate(b))
+                parts[t, i, j] = past + sum(-value * (parts[t - k, i, j] if t >= k else 0) for k, value in enumerate(a[1:], 1))
+        disturbance = 0.9 * disturbance + 0.02 * rng.normal()
+        y[t] = parts[t].sum(1) + disturbance + 0.02 * rng.normal(size=n_y)
+        error[t] = set_points[t // hold] - y[t, :n_loops]
+        u[t + 1] = u[t]
+        u[t + 1, :n_loops] += gains[:, 0] * (error[t] - error[t - 1]) + gains[:, 1] * error[t]  # error[-1] is zero at first
+    return Stretch(y, u[1:])
+
+
 def modelled(parts, params, members=8):
     n_y, n_u = parts[0][0].y.shape[1], parts[0][0].u.shape[1]
     names = [f"y{i}" for i in range(n_y)], [f"u{j}" for j in range(n_u)]
@@ -27,7 +50,7 @@ def modelled(parts, params, members=8):
 
 
 def found(channels, gains, params):
-    return modelled(hold_out([Stretch(*Loop(channels, gains).record())], 0.25), params)
+    return modelled(hold_out([record(channels, gains)], 0.25), params)
 
 
 def gain(equation):
@@ -78,10 +101,10 @@ def test_the_poles_of_an_underdamped_plant_are_found(params):
 
 
 def test_no_step_of_the_fit_raises_the_errors():
-    y, u = Loop([[(*FIRST, 2)]], [(0.3, 0.03)]).record()
-    record, structure = identify.Record([(y[:, 0], u)], 12), Structure(2, (1,))
-    starts = [float(sum((e**2).sum() for e in record.errors(structure, start))) for start in record.starts(structure)]
-    costs = [float(sum((e**2).sum() for e in record.errors(structure, record.fit(structure, steps=n)))) for n in (1, 3, 12)]
+    piece = record([[(*FIRST, 2)]], [(0.3, 0.03)])
+    given, structure = identify.Record([(piece.y[:, 0], piece.u)], 12), Structure(2, (1,))
+    starts = [float(sum((e**2).sum() for e in given.errors(structure, start))) for start in given.starts(structure)]
+    costs = [float(sum((e**2).sum() for e in given.errors(structure, given.fit(structure, steps=n)))) for n in (1, 3, 12)]
     assert min(starts) >= costs[0] >= costs[1] >= costs[2]
 
 
@@ -146,17 +169,17 @@ def test_a_disturbance_that_grows_with_the_deviation_is_told_from_a_fixed_one(pa
 
 
 def test_what_the_data_cannot_carry_is_said(params):
-    y, u = Loop([[(*FIRST, 1)]], [(0.3, 0.03)]).record()
-    idle = np.column_stack([u, 0.1 * np.random.default_rng(0).normal(size=len(u))])
-    model = modelled(hold_out([Stretch(y, idle)], 0.25), params, members=4)
+    piece = record([[(*FIRST, 1)]], [(0.3, 0.03)])
+    given = Stretch(piece.y, np.column_stack([piece.u, 0.1 * np.random.default_rng(0).normal(size=len(piece))]))
+    model = modelled(hold_out([given], 0.25), params, members=4)
     assert model.warnings == ("the data do not tell an effect of u1 on any output from none",)
-    good = identify.validate_model(model, [Stretch(y, idle)], 30, ["y"], params)
+    good = identify.validate_model(model, [given], 30, ["y"], params)
     assert good.fit[0] > 0.8
     assert not good.warnings
     rng = np.random.default_rng(0)
     noise = [Stretch(rng.normal(size=(600, 1)).cumsum(0) * 0.05, rng.normal(size=(600, 2)))]
     assert "unexplained: too much to learn from" in identify.validate_model(model, noise, 30, ["y"], params).warnings[0]
-    short = [Stretch(y[:20], idle[:20])]
+    short = [given[:20]]
     with pytest.raises(InputError, match="no stretch of the record is longer than"):
         modelled((short, short), params)
 

@@ -18,45 +18,40 @@ from helpers.own_plant.tank_history import FILE
 from helpers.report import plant_report
 from helpers.runs.sources import PROJECT
 from tests.own_plant.plants import MadeUpPlant
+from tests.settings.test_params import edit
 
-FILES = {
-    "learning.yaml": (
-        ("epoch_share: {value: 0.05,", "epoch_share: {value: 0.02,"),
-        ("episodes: {value: 40,", "episodes: {value: 16,"),
-        ("hidden_cells: {value: [20, 20]", "hidden_cells: {value: [6, 6]"),
-    ),
-    "own_plant.yaml": (
-        ("orders: {value: [1, 2, 3, 4],", "orders: {value: [1, 2],"),
-        ("longest_dead_time: {value: 10,", "longest_dead_time: {value: 2,"),
-        ("penalties: {value: [0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0],", "penalties: {value: [1.0, 100.0],"),
-        ("models: {value: 150,", "models: {value: 20,"),
-        ("explore: {value: 60,", "explore: {value: 8,"),
-        ("test: {value: 60,", "test: {value: 6,"),
-    ),
-}
+LEARNING = {"scales.smoke.epoch_share": 0.02, "scales.smoke.episodes": 16, "policy.hidden_cells": [6, 6]}
+OWN_PLANT = {"identification.orders": [1, 2], "identification.longest_dead_time": 2, "rivals.penalties": [1.0, 100.0]}
+OWN_PLANT |= {"gate.models": 20, "online.explore": 8, "online.test": 6}
 
 
 @pytest.fixture(scope="module")
 def quick_root(root, tmp_path_factory):
     """The parameter files with a smoke scale that takes seconds."""
     folder = shutil.copytree(root, tmp_path_factory.mktemp("quick") / "params")
-    for name, changes in FILES.items():
-        text = (folder / name).read_text(encoding="utf-8")
-        for old, new in changes:
-            assert old in text
-            text = text.replace(old, new)
-        (folder / name).write_text(text, encoding="utf-8")
+    for name, changes in (("learning.yaml", LEARNING), ("own_plant.yaml", OWN_PLANT)):
+        edit(folder / name, {f"{key}.value": value for key, value in changes.items()})
     return folder
 
 
-@pytest.fixture
-def opened(tmp_path, quick_root):
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory, quick_root):
     """A made-up plant with so many outputs and inputs, opened: enough epochs, steps and episodes to see that all fits together."""
 
     def made_up(n_y, n_u, table=None, **changes):
-        return learn.open_plant(MadeUpPlant(n_y, n_u).write(tmp_path, table, **changes), quick_root, "smoke", 0)
+        path = MadeUpPlant(n_y, n_u).write(tmp_path_factory.mktemp("plant"), table, **changes)
+        return learn.open_plant(path, quick_root, "smoke", 0)
 
     return made_up
+
+
+@pytest.fixture(scope="module")
+def trained(opened):
+    """The model of a plant with one loop, the workshop of its controllers, and a policy made there."""
+    plant = opened(1, 1)
+    identified, _ = learn.identify_plant(plant)
+    workshop = learn.open_workshop(plant, identified)
+    return identified, workshop, learn.learn_policy(workshop, workshop.record)[0]
 
 
 @pytest.mark.parametrize(("n_y", "n_u"), [(1, 1), (3, 2), pytest.param(2, 3, marks=pytest.mark.torture)])
@@ -173,31 +168,26 @@ def test_what_cannot_end_well_is_refused_before_learning(changes, output, status
     assert not (tmp_path / "out").exists()
 
 
-def test_a_record_with_too_few_episodes_of_one_task_costs_the_weights_only(opened):
-    plant = opened(1, 1)
-    workshop = learn.open_workshop(plant, learn.identify_plant(plant)[0])
+def test_a_record_with_too_few_episodes_of_one_task_costs_the_weights_only(trained):
+    plant = trained[1].plant
     longer = replace(plant, description=plant.description.model_copy(update={"horizon": 300}))
-    found, (words,) = plant_report.offline(longer, workshop)
+    found, (words,) = plant_report.offline(longer, trained[1])
     assert found == {}
     assert words.startswith("the weights of the record's controller were not found: plant.csv: 0 episodes of 300 samples")
 
 
 @pytest.mark.parametrize(("worse", "share"), [(1.0, 1.0), (-1.0, 2.0**-online.HALVINGS)])
-def test_the_disturbance_is_halved_until_the_exploring_episodes_are_hardly_ever_worse(opened, worse, share):
-    plant = opened(1, 1)
-    identified, _ = learn.identify_plant(plant)
+def test_the_disturbance_is_halved_until_the_exploring_episodes_are_hardly_ever_worse(trained, worse, share):
+    _, workshop, policy = trained
+    plant = workshop.plant
     settings = plant.params.online.model_copy(update={"worse": 2 * worse})
-    workshop = learn.open_workshop(replace(plant, params=plant.params.model_copy(update={"online": settings})), identified)
-    policy, _ = learn.learn_policy(workshop, workshop.record)
-    size = online.gentle(workshop, policy, plant.stream("a test"))
+    plant = replace(plant, params=plant.params.model_copy(update={"online": settings}))
+    size = online.gentle(replace(workshop, plant=plant), policy, plant.stream("a test"))
     assert torch.equal(size, share * settings.disturbance * workshop.operation.bounds.span)
 
 
-def test_a_few_episodes_of_the_plant_change_the_policy_only_for_a_better_one(opened):
-    plant = opened(1, 1)
-    identified, _ = learn.identify_plant(plant)
-    workshop = learn.open_workshop(plant, identified)
-    policy, _ = learn.learn_policy(workshop, workshop.record)
+def test_a_few_episodes_of_the_plant_change_the_policy_only_for_a_better_one(trained):
+    identified, workshop, policy = trained
     improvement = online.improve_on_plant(workshop, identified, policy, workshop.nominal)
     assert improvement.taken == (improvement.policy is not policy)
     assert improvement.words.startswith("20 episodes of the plant: ")

@@ -57,22 +57,11 @@ def test_what_is_said_wrongly_about_a_file_is_named_with_its_key(read):
     assert "holds no number, the first is '50,006" in refusal(read, dated, decimal=".", **MINUTES)
 
 
-@pytest.mark.parametrize(
-    "form",
-    [
-        "%d/%m/%Y %H:%M",
-        "%m/%d/%Y %H:%M",
-        "%d.%m.%Y %H:%M:%S",
-        "%d-%m-%y %H:%M:%S",
-        "%m/%d/%Y %I:%M:%S %p",
-        "%d/%m/%Y %H:%M:%S,000",
-        "%d/%m/%Y %H:%M +01:00",
-        "%Y/%m/%d %H:%M",
-        "%d-%b-%Y %H:%M:%S",
-        "%H:%M:%S",
-        "%I:%M %p",
-    ],
-)
+FORMS = ["%d/%m/%Y %H:%M", "%m/%d/%Y %H:%M", "%Y/%m/%d %H:%M", "%d.%m.%Y %H:%M:%S", "%d-%m-%y %H:%M:%S", "%d-%b-%Y %H:%M:%S"]
+FORMS += ["%m/%d/%Y %I:%M:%S %p", "%d/%m/%Y %H:%M:%S,000", "%d/%m/%Y %H:%M +01:00", "%H:%M:%S", "%I:%M %p"]
+
+
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("later", [0, 7], ids=["days to 12", "days beyond"])
 def test_day_and_month_are_told_apart_and_midnight_begins_a_day(read, form, later):
     clock = read(stamped((STAMPS + pd.Timedelta(days=later)).strftime(form)), **MINUTES).table["clock"]

@@ -43,21 +43,18 @@ def test_predictive_law_against_the_plan_written_out(study):
     A, B = process.state_step.numpy(), process.input_step.numpy()
     span = (task.input_high - task.input_low).numpy()
     observation, last = np.array([0.9, 3.9]), np.array([11.0, 40.0])
-    # x_i = A^i x_0 + sum_j A^(i-1-j) B (last + the sum of the moves up to j)
-    rows, targets = [], []
-    for i in range(1, horizon + 1):
-        effect = np.zeros((2, 2 * horizon))
-        free = np.linalg.matrix_power(A, i) @ observation
-        for j in range(i):
-            step = np.linalg.matrix_power(A, i - 1 - j) @ B
-            free = free + step @ last
-            for k in range(j + 1):
-                effect[:, 2 * k : 2 * k + 2] += step
-        rows.append(effect / task.error_scale.numpy()[:, None])
-        targets.append((task.set_point.numpy() - free) / task.error_scale.numpy())
-    rows.append(np.sqrt(penalty) * np.diag(np.tile(1 / span, horizon)))
-    targets.append(np.zeros(2 * horizon))
-    plan = np.linalg.lstsq(np.concatenate(rows), np.concatenate(targets), rcond=None)[0]
+
+    def residuals(moves):
+        x, u, parts = observation, last, []
+        for move in moves.reshape(horizon, 2):
+            u = u + move
+            x = A @ x + B @ u
+            parts += [(x - task.set_point.numpy()) / task.error_scale.numpy(), np.sqrt(penalty) * move / span]
+        return np.concatenate(parts)
+
+    free = residuals(np.zeros(2 * horizon))
+    effect = np.column_stack([residuals(move) - free for move in np.eye(2 * horizon)])
+    plan = np.linalg.lstsq(effect, -free, rcond=None)[0]
     controller = SaturatedLQ(process.state_step, process.input_step, task, horizon, penalty)
     command, memory = controller.act(torch.tensor(observation[None]), torch.tensor(last[None]))
     np.testing.assert_allclose(command[0], last + plan[:2], rtol=1e-9)

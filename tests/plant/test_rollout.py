@@ -9,19 +9,21 @@ from helpers.plant.process import LinearProcess
 from helpers.plant.rollout import rollout, stream
 
 F64 = torch.float64
+CALM = {"disturbance": (0.0, 0.0), "observation_noise": (0.0, 0.0)}
 
 
 class Constant:
-    """A controller that always asks for the same inputs."""
+    """A controller, and a tracker, that always asks for the same inputs and keeps what it is shown."""
 
     def __init__(self, command):
-        self.command = torch.tensor(command, dtype=F64)
+        self.command, self.seen = torch.tensor(command, dtype=F64), []
 
-    def start(self, n_trajectories, n_steps, generator):
-        return n_trajectories
+    def start(self, n_trajectories, *_):
+        return None
 
-    def act(self, observation, memory):
-        return self.command.expand(memory, -1), memory
+    def act(self, observation, *seen):
+        self.seen.append(observation)
+        return self.command.expand(len(observation), -1), seen[-1]
 
 
 class Echo:
@@ -45,9 +47,8 @@ CONTROLLERS = {
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
-def test_shapes_bounds_and_draws_and_the_same_seed_gives_the_same_episodes_bit_for_bit(study, name):
+def test_shapes_bounds_and_draws_and_the_same_seed_gives_the_same_episodes_bit_for_bit(case, name):
     """By one controller object: no episode inherits another's memory."""
-    case = study()
     controller = CONTROLLERS[name](case)
     batch, other, again = (rollout(case.process, controller, case.task, 7, stream(seed, "rollout")) for seed in (0, 1, 0))
     assert batch.x.shape == batch.y.shape == (51, 7, 2)
@@ -74,6 +75,33 @@ def test_draws_are_standard_normal_and_independent(study):
         assert abs(np.corrcoef(signal[:-1].flatten(), signal[1:].flatten())[0, 1]) < 5 / np.sqrt(signal[1:].numel())
 
 
+def plain_loop(params, x, **reading):
+    """States and commands of the demonstrator in plain floats, without noise, under another reading of its law where asked."""
+    memory = reading.get("error_memory", 0.0)
+    process, gains, target, dt = params.process, params.demonstrator, np.array(params.case.set_point), params.process.sampling_time
+    A, B, m = np.array(process.drift_state), np.array(process.drift_input), process.integration_steps
+    kp, ki, kd = (np.array(gain) for gain in (gains.proportional, gains.integral, gains.derivative))
+    states, commands, total = [np.array(x)], [], np.zeros(2)
+    before, last = np.zeros(2) if reading.get("derivative_from_zero") else None, target - states[0]
+    for _ in range(process.horizon):
+        x = states[-1]
+        error, last = (last if reading.get("delay") else target - x), target - x
+        tried = total + error * dt
+        if reading.get("bounded_integral"):
+            tried = np.clip(ki * tried, process.input_low, process.input_high) / ki
+        seen = tried - (1 - reading.get("present_error", 1.0)) * error * dt
+        smooth = error if before is None else memory * before + (1 - memory) * error
+        change = 0.0 if before is None else (smooth - before) / dt
+        commands.append(kp * error + ki * seen + kd * change)
+        u = np.clip(commands[-1], process.input_low, process.input_high)
+        frozen = (u != commands[-1]) & (np.sign(error) == np.sign(commands[-1])) & reading.get("conditional_integration", False)
+        total, before = np.where(frozen, total, tried), smooth
+        for _ in range(m):
+            x = x + (A @ x + B @ u) * dt / m
+        states.append(x)
+    return np.array(states), np.array(commands)
+
+
 class FirstSensorFails(LinearProcess):
     """A process whose first trajectory goes another way, which must leave the others as they are."""
 
@@ -86,32 +114,15 @@ class FirstSensorFails(LinearProcess):
 @pytest.mark.equation("3.1.6")
 def test_without_noise_an_episode_is_a_plain_loop(study):
     """y_t observes x_t, u_t acts on y_t, x_{t+1} follows from x_t and the bounded u_t; the PID integrates beyond the bounds."""
-    case = study(
-        process={"disturbance": (0.0, 0.0), "observation_noise": (0.0, 0.0)},
-        case_study={"initial_mean": (0.3, -0.4), "initial_std": (0.0, 0.0)},
-    )
+    case = study(process=CALM, case_study={"initial_mean": (0.3, -0.4), "initial_std": (0.0, 0.0)})
     found = rollout(FirstSensorFails(case.params.process, F64), case.pid, case.task, 2, stream(0, "plain"))
-    params, gains = case.params.process, case.params.demonstrator
-    a, b, dt, m = np.array(params.drift_state), np.array(params.drift_input), params.sampling_time, params.integration_steps
-    kp, ki, kd = (np.array(gain) for gain in (gains.proportional, gains.integral, gains.derivative))
-    x, total, before = np.array([0.3, -0.4]), np.zeros(2), None
-    for t in range(50):
-        np.testing.assert_allclose(found.x[t, 1], x, rtol=0, atol=1e-11)
-        error = np.array([-1.0, 4.0]) - x
-        total = total + error * dt
-        change = 0 if before is None else (error - before) / dt
-        command, before = kp * error + ki * total + kd * change, error
-        u = np.clip(command, params.input_low, params.input_high)
-        np.testing.assert_allclose(found.command[t, 1], command, rtol=0, atol=1e-8)
-        np.testing.assert_allclose(found.u[t, 1], u, rtol=0, atol=1e-8)
-        for _ in range(m):
-            x = x + (a @ x + b @ u) * dt / m
-    np.testing.assert_allclose(found.x[50, 1], x, rtol=0, atol=1e-11)
+    states, commands = plain_loop(case.params, [0.3, -0.4])
+    np.testing.assert_allclose(found.x[:, 1], states, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(found.command[:, 1], commands, rtol=0, atol=1e-8)
+    inputs = np.clip(commands, case.params.process.input_low, case.params.process.input_high)
+    np.testing.assert_allclose(found.u[:, 1], inputs, rtol=0, atol=1e-8)
     assert torch.equal(found.x[:, 1], found.y[:, 1])
     assert not torch.equal(found.u[:, 1], found.command[:, 1])
-
-
-# Random streams
 
 
 def draw(*arguments, n=1000):

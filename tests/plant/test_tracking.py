@@ -8,21 +8,9 @@ import torch
 from helpers.plant.rollout import rollout, stream
 from helpers.plant.tracking import AtSetPoint, Scenarios, track
 from tests.learning.test_tracking_policy import bounds, tracking_pid
+from tests.plant.test_rollout import Constant
 
 N, T = 5, 12
-
-
-class Constant:
-    """Asks for the same input at every sample."""
-
-    def __init__(self, command):
-        self.command = torch.tensor(command, dtype=torch.float64)
-
-    def start(self, n_trajectories):
-        return 0
-
-    def act(self, y, set_point, u_previous, memory):
-        return self.command.expand_as(u_previous), memory + 1
 
 
 @pytest.fixture
@@ -73,8 +61,7 @@ def test_a_load_reaches_the_process_and_not_the_controller(case, scenarios):
     load = torch.zeros(T, N, 2, dtype=case.dtype)
     load[4:] = 2.0
     plain, loaded = (track(Constant([1.0, 1.0]), replace(scenarios, load=each), bounds(case)) for each in (0 * load, load))
-    moved = track(Constant([3.0, 3.0]), replace(scenarios, start=loaded.x[4]), bounds(case))
     assert torch.equal(plain.u, loaded.u)
     assert torch.equal(plain.x[:5], loaded.x[:5])
-    first = case.process.step(loaded.x[4], moved.u[0], scenarios.disturbance[4])
+    first = case.process.step(loaded.x[4], torch.full_like(load[4], 3.0), scenarios.disturbance[4])
     torch.testing.assert_close(loaded.x[5], first, rtol=1e-12, atol=1e-12)

@@ -148,7 +148,7 @@ def budget_figure() -> Figure:
     rows = [(s, c, n, c + s + n / 500) for s in range(3) for c in (1, 2) for n in (500, 20, 100)]
     budget = pd.DataFrame(rows, columns=["seed", "case", "episodes_per_epoch", "objective"])
     levels = {"PID": 1.5, "offline policy": 1.2, "minimum variance on y": 5.0}
-    return figures.budget_figure(budget, {1: levels, 2: levels}, {1: "Case Study I", 2: "Case Study II"})
+    return figures.budget_figure(budget, {1: levels, 2: levels})
 
 
 KINDS = {

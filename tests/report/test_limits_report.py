@@ -116,7 +116,7 @@ def test_several_seeds_show_medians(results):
 )
 def test_what_a_seed_never_reached_counts_as_long(times, shown):
     rows = pd.DataFrame({"case": 1, "seed": range(len(times)), "controller": "mpc", "metric": "rise_time:T", "value": times})
-    table = limits_report._quality(rows, limits_report.QUALITY["response"])
+    table = limits_report._quality(rows, "response")
     assert table["Rise 10-90 %, $T^*$ (time)"].tolist() == [shown]
 
 
@@ -184,13 +184,13 @@ def test_what_needs_no_plant(results):
 def test_the_section_of_the_template(results):
     """What the report says of the limits, from the template's own section."""
     text = (PROJECT / "reports/template/report.md.jinja").read_text(encoding="utf-8")
-    start, end = text.index("## Which controller to take"), text.index("{% if one_policy | length %}\n\n## One policy")
+    start, end = text.index("## Which controller to take"), text.index("{% if tables.one_policy is defined %}\n\n## One policy")
     section = text[text.index("{% from") : text.index("{% set beta")] + "{% if limits %}" + text[start:end]
     template, run = typesetting.environment().from_string(section), results(1)
     found = limits_findings.find(run) | {"there": {"A x 1.3, B x 0.7": {1: ["offset-free MPC"], 2: []}}}
     shown = {"tables": limits_report.tabulate(run), "limits": found, "n_seeds": 1, "level_words": "95 %", "appendix": None}
     shown |= {"heat_maps": ["model_case_1", "set_point_case_2"], "grids": {"model": "m", "set_point": "s"}}
-    rendered = typesetting.numbered(template.render(shown, rivals={}, one_policy=()))
+    rendered = typesetting.numbered(template.render(shown, rivals={}))
     assert "10.0 [9.0, 11.0]" in rendered
     assert "](figures/limits_budget.svg)" in rendered
     assert "reaches\n  150.0 and 81.8 % of the objective of the best learner after 500 episodes in Case Studies" in rendered

@@ -35,11 +35,7 @@ class Quantity(Record):
 
 
 class Claim(Record):
-    """One checkable sentence of the paper, and what decides about it.
-
-    Attributes:
-        changed: when and why the test was changed after results were known.
-    """
+    """One checkable sentence of the paper, and what decides about it."""
 
     section: Text
     statement: Text
@@ -48,7 +44,7 @@ class Claim(Record):
     margin: Real | None = None
     why: Text
     quantities: dict[Text, Quantity] = Field(default_factory=dict)
-    changed: Dated | None = None
+    changed: Dated | None = None  # when and why the test was changed after results were known
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -70,11 +66,7 @@ def load_claims(root: Path) -> dict[str, Claim]:
 
 
 def collect(claims: Mapping[str, Claim], stages: Mapping[tuple[int, int, str], Stage]) -> pd.DataFrame:
-    """Every number that the claims refer to, from the scores.csv of the stages, by case, seed and name.
-
-    Returns:
-        A row for each case and quantity (<stage>/<run>/<metric>), its index, and a column for each seed; nan where it was not run.
-    """
+    """Every number that the claims refer to, by case and quantity (<stage>/<run>/<metric>), a column a seed; nan where not run."""
     pairs = ((claim.cases, quantity) for claim in claims.values() for quantity in claim.quantities.values())
     wanted = {(case, reference) for cases, quantity in pairs for case in cases for _, reference in quantity if reference}
     rows = [pd.DataFrame(columns=[*INDEX, "seed", "value"])]
@@ -98,11 +90,7 @@ class Verdict(NamedTuple):
 
 
 def judge(claim: Claim, values: pd.DataFrame) -> Verdict:
-    """The verdict on one quantity of a claim in one case.
-
-    Args:
-        values: a row for each seed, with the columns `value` and, where the test compares two, `against`.
-    """
+    """The verdict on one quantity of a claim, from a row a seed: the columns `value` and, where two are compared, `against`."""
     kind, _, side = claim.test.partition("_")
     if claim.test in WITHOUT_RUNS:
         return Verdict(WITHOUT_RUNS[claim.test], claim.why)
@@ -130,13 +118,9 @@ def judge(claim: Claim, values: pd.DataFrame) -> Verdict:
 
 
 def verdicts(claims: Mapping[str, Claim], values: pd.DataFrame) -> pd.DataFrame:
-    """All claims, a row for each case and quantity, in the order of the file.
+    """All claims with the columns `COLUMNS`, a row for each case and quantity, in the order of the file.
 
-    Args:
-        values: as `collect` returns them.
-
-    Returns:
-        Columns `COLUMNS`; median and interval are those of what the test compares with the margin.
+    `values` are those of `collect`; median and interval are those of what the test compares with the margin.
     """
     rows = []
     for name, claim in claims.items():

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,62 +16,41 @@ from helpers.runs.freshness import refuse, stale
 from helpers.runs.identity import inputs
 from helpers.settings.paper import HEADLINE, Params, PublishedCase, load, load_published
 
-DEMONSTRATIONS, ONLINE, BUDGET, EXPERIMENTS = "demonstrations", f"online_{HEADLINE}", "online_budget", "experiments"
+ONLINE, BUDGET, EXPERIMENTS = f"online_{HEADLINE}", "online_budget", "experiments"
 OFFLINE = {"offline": HEADLINE, "offline_printed": "printed"}  # stage in seeds.csv and the variant behind it
-REPORT = "05_report"
 SCORES = ("stage", "metric", "value")  # columns of scores.csv
 INFERRED = "inferred_settings"  # which has no case, and stands with the first seed
 LIMITS = ("attainable", "budget", "quality", "robustness", "safety")  # the parts of notebook 06, the last one written last
 ONE_POLICY, OWN_PLANT = "one_policy", "own_process"  # of notebooks 09 and 07, which are for no case and stand with the first
-SCRATCH = f"offline_{HEADLINE}"  # of a case that starts from another: the same learning without the transfer
 MADE_BY = {"demonstrations": "01", "offline": "02", "online": "03 (04 for the transfer case)", "transfer": "04"}
 
 
 @dataclass(frozen=True)
 class Results:
-    """What the stages of all cases and seeds wrote.
+    """What the stages of all cases and seeds wrote; a table is empty where it was not run.
 
-    Attributes:
-        params, published: by case.
-        stages: by case, seed and folder name.
-        seeds: columns case, seed, stage, metric, value. The stages: expert; minimum_variance; offline, online and online_y of
-            the headline variant (offline of a transfer case is after the transfer); offline_printed; offline_scratch (the
-            transfer case learned from nothing). The ratios of `scorecard.relative` are among the rows.
-        made_from: `identity.inputs` of the report itself.
-        missing: of the seeds asked for, those of which a stage is missing, where that is allowed.
-        claims: columns `claims.COLUMNS`; claim_values: the numbers behind them, of `claims.collect`; budget: seed, case,
-            episodes_per_epoch, objective; trials: trial, family, description, case, seed, gap. Each is empty where it was not run.
-        inferred: what notebook 00 wrote, if it was run.
-        limits: by case, seed and part of notebook 06, where it was run to its end.
-        one_policy, own_plant: summary.csv of notebook 09 and scores.csv of notebook 07 with a column seed; empty where not run.
-        search: what `make search` wrote, if it was run.
-        beyond: every stage beyond the paper's own runs, those of claims, budget, trials, limits and inferred settings.
-        left_out: of these runs the notebooks of which a result is there, but made from other inputs than there are now.
+    The stages in `seeds`: expert; minimum_variance; offline, online and online_y of the headline variant (offline of a transfer
+    case is after the transfer); offline_printed; offline_scratch (the transfer case learned from nothing).
     """
 
     scale: str
-    params: dict[int, Params]
-    published: dict[int, PublishedCase]
-    stages: dict[tuple[int, int, str], Stage]
-    seeds: pd.DataFrame
-    claims: pd.DataFrame
-    claim_values: pd.DataFrame
-    budget: pd.DataFrame
-    trials: pd.DataFrame
-    inferred: Stage | None = None
-    limits: Mapping[tuple[int, int, str], Stage] = field(default_factory=dict)
-    one_policy: pd.DataFrame = field(default_factory=pd.DataFrame)
-    own_plant: pd.DataFrame = field(default_factory=pd.DataFrame)
-    search: Stage | None = None
-    beyond: tuple[Stage, ...] = ()
-    made_from: Mapping[str, str] = field(default_factory=dict)
-    missing: tuple[int, ...] = ()
-    left_out: tuple[str, ...] = ()
-
-    @cached_property
-    def feature_names(self) -> list[str]:
-        """Names of the features in their order."""
-        return feature_names(next(iter(self.params.values())).process.controlled)
+    params: dict[int, Params]  # by case
+    published: dict[int, PublishedCase]  # by case
+    stages: dict[tuple[int, int, str], Stage]  # by case, seed and folder name
+    seeds: pd.DataFrame  # columns case, seed, stage, metric, value; with the ratios of `scorecard.relative`
+    claims: pd.DataFrame  # columns `claims.COLUMNS`
+    claim_values: pd.DataFrame  # the numbers behind the claims, of `claims.collect`
+    budget: pd.DataFrame  # columns seed, case, episodes_per_epoch, objective
+    trials: pd.DataFrame  # columns trial, family, description, case, seed, gap
+    inferred: Stage | None  # what notebook 00 wrote, if it was run
+    limits: Mapping[tuple[int, int, str], Stage]  # by case, seed and part of notebook 06, where it was run to its end
+    one_policy: pd.DataFrame  # summary.csv of notebook 09 with a column seed
+    own_plant: pd.DataFrame  # scores.csv of notebook 07 with a column seed
+    search: Stage | None  # what `make search` wrote, if it was run
+    beyond: tuple[Stage, ...]  # every stage beyond the paper's own runs
+    made_from: Mapping[str, str]  # `identity.inputs` of the report itself
+    missing: tuple[int, ...]  # of the seeds asked for, those of which a stage is missing, where that is allowed
+    left_out: tuple[str, ...]  # notebooks with a result among those beyond that was made from other inputs than there are now
 
     @cached_property
     def n_seeds(self) -> int:
@@ -103,11 +82,7 @@ def offline_folder(params: Params, variant: str = HEADLINE) -> str:
 
 
 def stacked(stages: Mapping[tuple[int, int], Stage], name: str, columns: tuple[str, ...] = ()) -> pd.DataFrame:
-    """One table of several stages, with columns case and seed, a case of its own before that of the stage; empty without any.
-
-    Args:
-        columns: those that the table must have.
-    """
+    """A table of several stages, each with these columns, and with seed and case (its own before the stage's); empty for none."""
     tables = {place: stage.table(name, columns) for place, stage in stages.items()}
     frames = [table.assign(case=table.get("case", case), seed=seed) for (case, seed), table in tables.items()]
     return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
@@ -118,8 +93,7 @@ def collect(
 ) -> Results:
     """Read every stage of every case and seed below `root`; claims, budget, trials and limits where they were run and still hold.
 
-    Args:
-        missing_allowed: leave out a seed of which a stage is missing, as long as another seed is whole.
+    Where it is allowed, a seed of which a stage is missing is left out, as long as another seed is whole.
 
     Raises:
         ArtifactError: if a stage is missing or damaged, or one of the paper's own runs was made from other parameters, code,
@@ -128,57 +102,56 @@ def collect(
     params = {case: load(params_root, case) for case in cases}
     published = {case: entry for case, entry in load_published(params_root).items() if case in cases}
     names = {case: _folders(record) for case, record in params.items()}
+
+    def place(case: int, seed: int, folder: str) -> Path:
+        return root / scale / f"seed_{seed}" / f"case_{case}" / folder
+
     seeds_found = list(range(n_seeds))
     if missing_allowed:
-        places = [f"case_{case}/{folder}/{RECORD}" for case in cases for folder in names[case]]
-        whole = [seed for seed in seeds_found if all((root / scale / f"seed_{seed}" / place).is_file() for place in places)]
+        asked = [(case, folder) for case in cases for folder in names[case]]
+        whole = [seed for seed in seeds_found if all((place(case, seed, folder) / RECORD).is_file() for case, folder in asked)]
         seeds_found = whole or seeds_found  # without any, the first file that is missing is named below
     stages: dict[tuple[int, int, str], Stage] = {}
     frames = []
     for case, seed in itertools.product(cases, seeds_found):
         for folder, stage_names in names[case].items():
             made_by = f"notebook {MADE_BY[folder.split('_')[0]]} for case {case} and seed {seed}"
-            stage = stages[case, seed, folder] = load_stage(root / scale / f"seed_{seed}" / f"case_{case}" / folder, made_by)
-            scores = stacked({(case, seed): stage}, "scores.csv", SCORES)
-            frames.append(scores.assign(stage=scores["stage"].map(stage_names)).dropna(subset="stage"))
-    seeds = pd.concat(frames, ignore_index=True)[["case", "seed", *SCORES]]
+            stage = stages[case, seed, folder] = load_stage(place(case, seed, folder), made_by)
+            scores = stage.table("scores.csv", SCORES)
+            scores = scores.assign(case=case, seed=seed, stage=scores["stage"].map(stage_names))
+            frames.append(scores.dropna(subset="stage")[["case", "seed", *SCORES]])
+    seeds = pd.concat(frames, ignore_index=True)
     features = feature_names(next(iter(params.values())).process.controlled)
     seeds = pd.concat([seeds, scorecard.relative(seeds, published, features)], ignore_index=True)
 
     def optional(folder: str, made_by: str, of_cases: tuple[int, ...] = cases) -> dict[tuple[int, int], Stage]:
         """A stage by case and seed, where it was run."""
-        places = itertools.product(of_cases, seeds_found)
-        paths = {(case, seed): root / scale / f"seed_{seed}" / f"case_{case}" / folder for case, seed in places}
-        return {place: load_stage(path, made_by) for place, path in paths.items() if (path / RECORD).is_file()}
+        found = [key for key in itertools.product(of_cases, seeds_found) if (place(*key, folder) / RECORD).is_file()]
+        return {key: load_stage(place(*key, folder), made_by) for key in found}
 
+    inferred = root / scale / "seed_0" / INFERRED
     runs: dict[Any, dict[Any, Stage]] = {
         EXPERIMENTS: optional(EXPERIMENTS, "notebook 08"),
         BUDGET: optional(BUDGET, "the online budget"),
         ONE_POLICY: optional(ONE_POLICY, "notebook 09", (1,)),
         OWN_PLANT: optional(OWN_PLANT, "notebook 07", (1,)),
         LIMITS: {
-            (*place, part): load_stage(last.folder.with_name(f"limits_{part}"), "notebook 06")
-            for place, last in optional(f"limits_{LIMITS[-1]}", "notebook 06").items()
+            (*key, part): load_stage(place(*key, f"limits_{part}"), "notebook 06")
+            for key in optional(f"limits_{LIMITS[-1]}", "notebook 06")
             for part in LIMITS
         },
-        INFERRED: {},
+        INFERRED: {INFERRED: load_stage(inferred, "notebook 00")} if (inferred / RECORD).is_file() else {},
     }
-    if (path := root / scale / "seed_0" / INFERRED / RECORD).is_file():
-        runs[INFERRED][INFERRED] = load_stage(path.parent, "notebook 00")
-    trials = {
-        (case, name): optional(offline_folder(record, name), f"the trial '{name}'", (case,))
-        for case, record in params.items()
-        for name in record.trials
-    }
-    runs |= trials
+    for case, record in params.items():
+        for name in record.trials:
+            runs[case, name] = optional(offline_folder(record, name), f"the trial '{name}'", (case,))
     changed = stale([*stages.values(), *(stage for run in runs.values() for stage in run.values())], root / scale, params_root)
     refuse({stage.folder: changed[stage.folder] for stage in stages.values() if stage.folder in changed})
     left_out = {stage.record["notebook"] for run in runs.values() for stage in run.values() if stage.folder in changed}
     for name, run in runs.items():
-        runs[name] = {place: stage for place, stage in run.items() if stage.record["notebook"] not in left_out}
-    experiments = runs[EXPERIMENTS]
-    known = claims.load_claims(params_root) if experiments else {}
-    claim_values = claims.collect(known, stages | {(*place, EXPERIMENTS): stage for place, stage in experiments.items()})
+        runs[name] = {key: stage for key, stage in run.items() if stage.record["notebook"] not in left_out}
+    known = claims.load_claims(params_root) if runs[EXPERIMENTS] else {}
+    claim_values = claims.collect(known, stages | {(*key, EXPERIMENTS): stage for key, stage in runs[EXPERIMENTS].items()})
     return Results(
         scale=scale,
         params=params,
@@ -188,14 +161,14 @@ def collect(
         claims=claims.verdicts(known, claim_values),
         claim_values=claim_values,
         budget=stacked(runs[BUDGET], "scores.csv", ("episodes_per_epoch", "objective")).infer_objects(),  # none: objects
-        trials=_trials(params, seeds, {place: runs[place] for place in trials}),
+        trials=_trials(params, seeds, runs),
         inferred=runs[INFERRED].get(INFERRED),
         limits=runs[LIMITS],
         one_policy=stacked(runs[ONE_POLICY], "summary.csv"),
         own_plant=stacked(runs[OWN_PLANT], "scores.csv"),
         search=load_stage(search_report.FOUND, "make search") if (search_report.FOUND / RECORD).is_file() else None,
         beyond=tuple(stage for run in runs.values() for stage in run.values()),
-        made_from=inputs(REPORT, params_root, scale),
+        made_from=inputs("05_report", params_root, scale),
         missing=tuple(seed for seed in range(n_seeds) if seed not in seeds_found),
         left_out=tuple(sorted(left_out)),
     )
@@ -203,24 +176,22 @@ def collect(
 
 def _folders(params: Params) -> dict[str, dict[str, str]]:
     """The stages of a case by folder, each with its names in scores.csv and their names in the report."""
-    folders = {DEMONSTRATIONS: {"expert": "expert"}}
+    folders = {"demonstrations": {"expert": "expert"}}
     folders[ONLINE] = {name: name for name in ("expert_paired", "online", "online_y", scorecard.MINIMUM_VARIANCE)}
     folders |= {offline_folder(params, variant): {"offline": name} for name, variant in OFFLINE.items()}
-    if params.case.offline.transfer_from is not None:
-        folders[SCRATCH] = {"offline": "offline_scratch"}
+    if params.case.offline.transfer_from is not None:  # the same learning without the transfer
+        folders[f"offline_{HEADLINE}"] = {"offline": "offline_scratch"}
     return folders
 
 
-def _trials(
-    params: Mapping[int, Params], seeds: pd.DataFrame, found: Mapping[tuple[int, str], Mapping[tuple[int, int], Stage]]
-) -> pd.DataFrame:
+def _trials(params: Mapping[int, Params], seeds: pd.DataFrame, runs: Mapping[Any, Mapping[Any, Stage]]) -> pd.DataFrame:
     """The feature gap of every offline trial that was run, after that of the variants that they are trials of."""
     rows = []
-    for (case, name), stages in found.items():
-        trial = params[case].trials[name]
-        for (_, seed), stage in stages.items():
-            scores = stage.table("scores.csv", SCORES).set_index("metric")["value"]
-            rows.append((name, trial.family, trial.title, case, seed, scores["feature_gap"]))
+    for case, record in params.items():
+        for name, trial in record.trials.items():
+            for (_, seed), stage in runs[case, name].items():
+                scores = stage.table("scores.csv", SCORES).set_index("metric")["value"]
+                rows.append((name, trial.family, trial.title, case, seed, scores["feature_gap"]))
     trials = pd.DataFrame(rows, columns=["trial", "family", "description", "case", "seed", "gap"])
     if trials.empty:
         return trials

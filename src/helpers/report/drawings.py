@@ -1,7 +1,7 @@
 """Our own drawings of Figures 1 and 2 of the paper and of the policy network."""
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -69,12 +69,7 @@ def framework_figure() -> Figure:
 
 
 def network_figure(hidden_cells: Sequence[int], n_controlled: int, n_manipulated: int, leaky_slope: float) -> Figure:
-    """The policy as a network: what it sees, its layers and activations, and how its outputs become a distribution.
-
-    Args:
-        hidden_cells: cells of each LSTM layer.
-        leaky_slope: slope of the leaky ReLU below zero.
-    """
+    """The policy as a network: what it sees, its layers and activations, and how its outputs become a distribution."""
     pitch, middle = 1.85, 1.35  # inches from layer to layer; height of the signal's way
     figure, axes = _canvas(5.4 + pitch * len(hidden_cells), 2.95)
     _box(axes, 0.85, middle + 0.7, 1.5, 0.95, f"errors $y_{{sp}} - y_t$\nof the loops\n({n_controlled})", "data")
@@ -113,16 +108,12 @@ def _canvas(width: float, height: float) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _box(
-    axes: Axes, x: float, y: float, width: float, height: float, text: str, fill: str, rotation: float = 0, size: float = 10
-) -> None:
+def _box(axes: Axes, x: float, y: float, width: float, height: float, text: str, fill: str, **style: Any) -> None:
     """A rounded box about the centre (x, y)."""
-    shape = "round,pad=0,rounding_size=0.08"
-    corner = (x - width / 2, y - height / 2)
-    axes.add_patch(
-        FancyBboxPatch(corner, width, height, boxstyle=shape, facecolor=FILLS[fill], edgecolor=INK, linewidth=1.1, zorder=3)
-    )
-    axes.text(x, y, text, ha="center", va="center", color=INK, rotation=rotation, fontsize=size, linespacing=1.35, zorder=4)
+    corner, shape = (x - width / 2, y - height / 2), "round,pad=0,rounding_size=0.08"
+    look: Any = {"boxstyle": shape, "facecolor": FILLS[fill], "edgecolor": INK, "linewidth": 1.1}
+    axes.add_patch(FancyBboxPatch(corner, width, height, zorder=3, **look))
+    axes.text(x, y, text, ha="center", va="center", color=INK, linespacing=1.35, zorder=4, **{"fontsize": 10, **style})
 
 
 def _path(axes: Axes, corners: Sequence[tuple[float, float]], colour: str = INK) -> None:
@@ -133,24 +124,13 @@ def _path(axes: Axes, corners: Sequence[tuple[float, float]], colour: str = INK)
     axes.add_patch(arrow)
 
 
-def _note(
-    axes: Axes,
-    x: float,
-    y: float,
-    text: str,
-    align: Literal["left", "center", "right"],
-    colour: str = INK,
-    weight: str = "normal",
-    background: str = "none",
-) -> None:
+def _note(axes: Axes, x: float, y: float, text: str, align: str, colour: str = INK, **style: Any) -> None:
     """Text beside a line, or upon it if it has a background."""
-    behind: Any = {"facecolor": background, "edgecolor": "none", "pad": 2}
-    axes.text(
-        x, y, text, ha=align, va="center", color=colour, fontsize=10, fontweight=weight, linespacing=1.3, zorder=4, bbox=behind
-    )
+    behind: Any = {"facecolor": style.pop("background", "none"), "edgecolor": "none", "pad": 2}
+    axes.text(x, y, text, ha=align, va="center", color=colour, fontsize=10, linespacing=1.3, zorder=4, bbox=behind, **style)
 
 
 def _activation(axes: Axes, x: float, y: float, text: str) -> None:
     """An activation on the way out of the layer whose right edge is at x."""
     _path(axes, [(x, y), (x + 0.15, y)])
-    _box(axes, x + 0.32, y, 0.34, 1.7, text, "reward", rotation=90, size=9.5)
+    _box(axes, x + 0.32, y, 0.34, 1.7, text, "reward", rotation=90, fontsize=9.5)

@@ -1,8 +1,7 @@
 """Figures 3-6, learning curves and the curve of the online budget.
 
-Every table may hold several runs, told apart by a column `seed`: each is then a thin line, their median a thick one. Every
-figure is drawn from tables and computes no result; `drawn_summary` reads back what was really drawn, and is the text form of
-every figure: a notebook shows the picture, and the numbers beneath it are what a later run is compared with.
+Every table may hold several runs, told apart by a column `seed`: each is then a thin line, their median a thick one.
+`drawn_summary`, what was really drawn, is the text form of every figure, which a notebook's later run is compared with.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,9 +19,9 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 
-from helpers.report.tables import feature_symbol, symbol
+from helpers.report.tables import capital, case_study, feature_symbol, symbol
 from helpers.settings.leaf import DEVIATION
 
 WIDTH = 9.0  # inches; at the 100 dpi of a screen the 900 pixels of the report
@@ -63,7 +62,7 @@ SET_POINT = "#ff8c00"
 LEVEL = "#00682f"  # horizontal lines to compare with are the expert's, mostly
 LINE_STYLES: dict[str, Any] = {"agent": "-", "expert": (0, (4, 1.6))}
 AIM: dict[str, Any] = {"color": SET_POINT, "linestyle": (0, (1, 1.2))}
-KIND_STYLES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.2, 1, 1.2)))
+KIND_STYLES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.2, 1, 1.2)), (0, (6, 1, 1, 1, 1, 1)))
 BAND_OPACITY = 0.2
 BAND = "mean ± standard deviation"
 SINGLE = "single seeds"
@@ -99,7 +98,6 @@ def control_figure(
     Args:
         response: columns of `stages.response_table`, and `seed` where there are several runs.
         set_point: of each loop, deviation variables.
-        descriptions: of variables in words, by name.
         zoom_from: first sample of the zoom; None: no zoom.
         size: width and height in inches, where the figure is not as wide as the report.
     """
@@ -109,18 +107,13 @@ def control_figure(
     grid = figure.add_gridspec(len(heights), n_loops, height_ratios=heights)
     for loop, (output, entry, target) in enumerate(zip(controlled, manipulated, set_point, strict=True)):
         axes = figure.add_subplot(grid[0, loop])
-        _draw_response(axes, response, output, target)
-        _finish(axes, ascii_uppercase[loop], output, words)
+        _draw_response(axes, response, output, words, ascii_uppercase[loop], target)
+        axes.set_xlabel("")
         axes.tick_params(labelbottom=False)
-        below = figure.add_subplot(grid[1, loop], sharex=axes)
-        _draw_response(below, response, entry)
-        _finish(below, "", entry, words)
-        below.set_xlabel(TIME_LABEL)
+        _draw_response(figure.add_subplot(grid[1, loop], sharex=axes), response, entry, words)
         if zoom_from is not None:
             zoom = figure.add_subplot(grid[2, loop])
-            _draw_response(zoom, response[response["time_index"] >= zoom_from], output, target, with_band=False)
-            _finish(zoom, ascii_uppercase[n_loops + loop], output, words, zoom_from)
-            zoom.set_xlabel(TIME_LABEL)
+            _draw_response(zoom, response, output, words, ascii_uppercase[n_loops + loop], target, zoom_from)
     figure.align_ylabels()
     _legend(figure, response, ("controlled", "manipulated"), agent_label, r"PID $\pi^E$")
     return figure
@@ -139,9 +132,7 @@ def tracking_figure(
     early = response[response["time_index"] <= FIRST]
     for loop, (output, target) in enumerate(zip(controlled, set_point, strict=True)):
         axes = figure.add_subplot(1, len(controlled), loop + 1)
-        _draw_response(axes, early, output, target)
-        _finish(axes, ascii_uppercase[loop], output, descriptions or {})
-        axes.set_xlabel(TIME_LABEL)
+        _draw_response(axes, early, output, descriptions or {}, ascii_uppercase[loop], target)
     _legend(figure, response, ("controlled",), agent_label, expert_label)
     return figure
 
@@ -154,60 +145,50 @@ def learning_curves(
 ) -> Figure:
     """Mean return, feature gap and reward weights against the epoch; a panel for each that the history holds.
 
-    Args:
-        history: columns epochs and mean_return, and where they exist feature_gap, alpha:<feature> and seed.
-        marks: epochs worth a vertical line, and why.
-        return_levels, gap_levels: horizontal lines by label, such as the expert's return or the paper's gap.
+    `history` has the columns epochs and mean_return, and where they exist feature_gap, alpha:<feature> and seed; `marks` are epochs
+    worth a vertical line, and why; the levels are horizontal lines by label, such as the expert's return or the paper's gap.
     """
-    weights = [column for column in history if column.startswith("alpha:")]
-    panels: dict[str, tuple[list[str], str, Mapping[str, float]]] = {  # columns, label of the axis, horizontal lines
-        "mean return": (["mean_return"], "discounted return (no unit)", return_levels or {})
-    }
+    names = [column.removeprefix("alpha:") for column in history if column.startswith("alpha:")]
+    panels = {"Mean return": ("discounted return (no unit)", return_levels or {})}  # label of the axis, horizontal lines
     if "feature_gap" in history and history["feature_gap"].notna().any():
-        panels["feature gap"] = (["feature_gap"], "gap to the expert (%, log scale)", gap_levels or {})
-    if weights:
-        panels["reward weights"] = (weights, "weight (no unit)", {})
+        panels["Feature gap"] = ("gap to the expert (%, log scale)", gap_levels or {})
+    if names:
+        panels["Reward weights"] = ("weight (no unit)", {})
     figure = empty_figure(max(6.0, WIDTH / 3 * len(panels)), 4.0)
-    epochs, n_seeds = history["epochs"], _n_seeds(history)
+    epochs = history["epochs"]
     points: Any = {"marker": "o" if epochs.nunique() <= FEW_POINTS else "", "markersize": 3}
-    for index, (panel, (columns, unit, levels)) in enumerate(panels.items()):
+    for index, (panel, (unit, levels)) in enumerate(panels.items()):
         axes = figure.add_subplot(1, len(panels), index + 1)
-        of_weights = columns is weights
-        styles = feature_styles([column.removeprefix("alpha:") for column in weights]) if of_weights else {panel: {"color": INK}}
+        letter, of_weights = ascii_uppercase[index], panel == "Reward weights"
+        columns = [f"alpha:{name}" for name in names] if of_weights else [panel.lower().replace(" ", "_")]
+        styles = feature_styles(names) if of_weights else {panel.lower(): {"color": INK}}
         for column, (label, style) in zip(columns, styles.items(), strict=True):
             _draw_runs(axes, history, "epochs", column, label=label, **style, **points)
-        axes.set_ylabel(unit)
-        if panel == "feature gap":
+        if panel == "Feature gap":
             axes.set_yscale("log")
-            axes.yaxis.set_major_formatter(FuncFormatter(_percent))
-            axes.yaxis.set_minor_formatter(FuncFormatter(_percent_of_few))
-        listed: list[Line2D] = [*axes.lines] if of_weights else []
-        if panel == "mean return":
-            listed += _seed_handles(n_seeds)
+            axes.yaxis.set_major_formatter(lambda share, _: f"{100 * share:.3g}")
+            axes.yaxis.set_minor_formatter(lambda share, _: f"{100 * share:.3g}" if f"{share:.0e}"[0] in "25" else "")
+        listed = [*axes.lines] if of_weights else _seed_handles(_n_seeds(history)) if panel == "Mean return" else []
         listed += _draw_levels(axes, epochs, levels)
         for (epoch, name), style in zip((marks or {}).items(), cycle(KIND_STYLES[2:]), strict=False):
             mark = axes.axvline(epoch, color=MUTED, linestyle=style, linewidth=1.2, label=name)
             listed += [] if of_weights else [mark]  # the other panels explain it
         if listed:
-            n_columns = len({name.rpartition("-")[2] for name in weights}) if of_weights else 1
+            n_columns = len({name.rpartition("-")[2] for name in names}) if of_weights else 1
             place: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.19), "frameon": False}
             legend = axes.legend(handles=listed, ncols=n_columns, columnspacing=1.0, handlelength=2.0, **place)
             for line in legend.get_lines():
                 line.set_marker("")  # it would hide the dashes
-        title = panel[:1].upper() + panel[1:] + (r" $\alpha$" if of_weights else "")
-        head(axes, ascii_uppercase[index] if len(panels) > 1 else "", title, f"{ascii_uppercase[index]} {panel}")
-        axes.set_xlabel("epoch")
+        title = rf"{panel} $\alpha$" if of_weights else panel
+        head(axes, letter if len(panels) > 1 else "", title, f"{letter} {panel.lower()}", xlabel="epoch", ylabel=unit)
         axes.xaxis.set_major_locator(MaxNLocator(5, integer=True, steps=[1, 2, 5, 10]))
     return figure
 
 
-def budget_figure(frame: pd.DataFrame, references: Mapping[int, Mapping[str, float]], titles: Mapping[int, str]) -> Figure:
+def budget_figure(frame: pd.DataFrame, references: Mapping[int, Mapping[str, float]]) -> Figure:
     """The objective after online learning against the plant episodes that each epoch was given, a panel for each case.
 
-    Args:
-        frame: columns seed, case, episodes_per_epoch, objective.
-        references: by case, objectives to compare with, by label: horizontal lines.
-        titles: by case.
+    `frame` has the columns seed, case, episodes_per_epoch, objective; `references` are horizontal lines by case and label.
     """
     cases = sorted(frame["case"].unique())
     figure = empty_figure(max(6.0, WIDTH / 3 * len(cases)), 3.8)
@@ -217,12 +198,10 @@ def budget_figure(frame: pd.DataFrame, references: Mapping[int, Mapping[str, flo
         _draw_runs(axes, rows, "episodes_per_epoch", "objective", **look)
         episodes = np.sort(rows["episodes_per_epoch"].unique())
         _draw_levels(axes, episodes, references[case], linewidth=1.2)
-        axes.set_xscale("log")
+        words = {"xlabel": "plant episodes per epoch (log)", "ylabel": "tracking objective $J$ (no unit)"}
+        head(axes, letter, case_study(case), f"{letter} case {case}", xscale="log", **words)
         axes.set_xticks(episodes, [f"{number:g}" for number in episodes])
         axes.xaxis.set_minor_locator(NullLocator())
-        axes.set_xlabel("plant episodes per epoch (log)")
-        axes.set_ylabel("tracking objective $J$ (no unit)")
-        head(axes, letter, titles[case], f"{letter} case {case}")
     handles = [*figure.axes[0].lines, *_seed_handles(_n_seeds(frame))[:1]]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return figure
@@ -235,21 +214,19 @@ def _draw_levels(axes: Axes, x: Any, levels: Mapping[str, float], **style: Any) 
     return [line for (line,) in lines]
 
 
-def head(axes: Axes, letter: str, title: str, name: str) -> None:
-    """The title of a panel, after its letter if it has one, and the name by which `drawn_summary` lists it."""
+def head(axes: Axes, letter: str, title: str, name: str, **others: Any) -> None:
+    """The title of a panel, after its letter if any, the name by which `drawn_summary` lists it, and what else `Axes.set` takes."""
     axes.set_title(f"$\\mathbf{{{letter}}}$  {title}" if letter else title, loc="left")
-    axes.set_label(name)
+    axes.set(label=name, **others)
 
 
 def feature_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """A line style for each feature, by its label: one colour a loop, one dash pattern a kind."""
-    parts = [name.rpartition("-") for name in names]
-    colours = dict(zip(dict.fromkeys(loop for loop, _, _ in parts), cycle(LOOP_COLOURS), strict=False))
-    dashes = dict(zip(dict.fromkeys(kind for _, _, kind in parts), cycle(KIND_STYLES), strict=False))
-    return {
-        feature_symbol(name): {"color": colours[loop], "linestyle": dashes[kind]}
-        for name, (loop, _, kind) in zip(names, parts, strict=True)
-    }
+    loops, _, kinds = zip(*(name.rpartition("-") for name in names), strict=True)
+    colours = dict(zip(dict.fromkeys(loops), cycle(LOOP_COLOURS), strict=False))
+    dashes = dict(zip(dict.fromkeys(kinds), cycle(KIND_STYLES), strict=False))
+    places = zip(names, loops, kinds, strict=True)
+    return {feature_symbol(name): {"color": colours[loop], "linestyle": dashes[kind]} for name, loop, kind in places}
 
 
 def drawn_summary(figure: Figure) -> pd.DataFrame:
@@ -297,35 +274,45 @@ def lay_out(figure: Figure) -> None:
 
 
 def _draw_response(
-    axes: Axes, response: pd.DataFrame, variable: str, set_point: float | None = None, with_band: bool = True
+    axes: Axes,
+    response: pd.DataFrame,
+    variable: str,
+    words: Mapping[str, str],
+    letter: str = "",
+    set_point: float | None = None,
+    zoom_from: int | None = None,
 ) -> None:
-    """Mean and band of one variable under expert and agent; an input is drawn as held until the next sample.
+    """Mean and band of one variable under expert and agent, in a zoom without the band; an input is held until the next sample.
 
     Of several runs the medians of mean and standard deviation at each sample, and the mean of each run as a thin line.
     """
+    response = response if zoom_from is None else response[response["time_index"] >= zoom_from]
     for controller in ("expert", "agent"):
         rows = response[(response["controller"] == controller) & (response["variable"] == variable)]
         if rows.empty:
             raise ValueError(f"response table: expected rows of controller '{controller}' and variable '{variable}', found none")
         kind = rows["kind"].iloc[0]
-        held: Any = {}
-        if kind == "manipulated":
+        colour, label, held = COLOURS[kind, controller], f"{kind}, {controller}", kind == "manipulated"
+        if held:
             last = rows["time_index"].max()
             rows = pd.concat([rows, rows[rows["time_index"] == last].assign(time_index=last + 1)])
-            held = {"step": "post"}
-        colour, label = COLOURS[kind, controller], f"{kind}, {controller}"
-        _draw_singles(axes, rows, "time_index", "mean", colour, held=bool(held))
-        middle = rows.groupby("time_index")[["mean", "std"]].median()
-        time, mean, std = middle.index.to_numpy(), middle["mean"].to_numpy(), middle["std"].to_numpy()
-        if with_band:
-            look: Any = {"color": colour, "alpha": BAND_OPACITY, "linewidth": 0, "label": f"{label}: {BAND}"}
-            axes.fill_between(time, mean - std, mean + std, **look, **held)
-        steps = "steps-post" if held else "default"
-        axes.plot(time, mean, color=colour, linestyle=LINE_STYLES[controller], drawstyle=steps, label=label)
+        style: Any = {"linestyle": LINE_STYLES[controller], "drawstyle": "steps-post" if held else "default"}
+        _draw_runs(axes, rows, "time_index", "mean", color=colour, label=label, **style)
+        if zoom_from is None:
+            middle = rows.groupby("time_index")[["mean", "std"]].median()
+            low, high = middle["mean"] - middle["std"], middle["mean"] + middle["std"]
+            band: Any = {"alpha": BAND_OPACITY, "linewidth": 0, "step": "post" if held else None}
+            axes.fill_between(middle.index, low, high, color=colour, label=f"{label}: {BAND}", **band)
     limits = [response["time_index"].min(), response["time_index"].max()]
     if set_point is not None:
         axes.plot(limits, [set_point, set_point], linewidth=2, label="set point", **AIM)
-    axes.set_xlim(*limits)
+    title = f"{capital(words.get(variable, ''))} {symbol(variable)}".strip()
+    if zoom_from is not None:
+        title = f"Zoom of {symbol(variable)} from sample {zoom_from}"
+    name = " ".join(part for part in (letter, variable, "" if zoom_from is None else "zoom") if part)
+    unit = f"{symbol(variable)} ({DEVIATION})".replace(", ", ",\n")
+    head(axes, letter, title, name, xlim=limits, xlabel=TIME_LABEL, ylabel=unit)
+    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True, steps=[1, 2, 5, 10]))
 
 
 def _n_seeds(frame: pd.DataFrame) -> int:
@@ -333,25 +320,16 @@ def _n_seeds(frame: pd.DataFrame) -> int:
 
 
 def _draw_runs(axes: Axes, frame: pd.DataFrame, x: str, y: str, **style: Any) -> None:
-    """The median over the runs at every x, and each run as a thin line where there are several."""
-    _draw_singles(axes, frame, x, y, style["color"])
+    """The median over the runs at every x, and each run as a thin line where there are several; the fainter, the more they are."""
+    if (n_seeds := _n_seeds(frame)) > 1:
+        lines = [run[[x, y]].to_numpy(dtype=float) for _, run in frame.sort_values(x).groupby("seed")]
+        if style.get("drawstyle") == "steps-post":
+            lines = [np.column_stack([run[:, 0].repeat(2)[1:], run[:, 1].repeat(2)[:-1]]) for run in lines]
+        thin: Any = {"linewidth": THIN, "alpha": max(0.4, 1 / n_seeds**0.5), "rasterized": len(frame) > MANY_POINTS}
+        pale = (np.array(to_rgb(style["color"])) + 1) / 2  # many of them on one another stay lighter than the median
+        axes.add_collection(LineCollection(lines, label=SINGLE, color=pale, **thin))
     middle = frame.groupby(x)[y].median()
     axes.plot(middle.index, middle, **style)
-
-
-def _draw_singles(axes: Axes, frame: pd.DataFrame, x: str, y: str, colour: str, held: bool = False) -> None:
-    """Each of several runs as a thin line, with steps where a value is `held` until the next x; the fainter, the more they are."""
-    n_seeds = _n_seeds(frame)
-    if n_seeds < 2:
-        return
-    lines = []
-    for _, run in frame.sort_values(x).groupby("seed"):
-        points = run[[x, y]].to_numpy(dtype=float)
-        lines.append(np.column_stack([points[:, 0].repeat(2)[1:], points[:, 1].repeat(2)[:-1]]) if held else points)
-    thin: Any = {"linewidth": THIN, "alpha": max(0.4, 1 / n_seeds**0.5), "rasterized": len(frame) > MANY_POINTS}
-    pale = (np.array(to_rgb(colour)) + 1) / 2  # many of them on one another stay lighter than the median
-    axes.add_collection(LineCollection(lines, label=SINGLE, color=pale, **thin))
-    axes.autoscale_view()
 
 
 def _seed_handles(n_seeds: int) -> list[Line2D]:
@@ -362,17 +340,6 @@ def _seed_handles(n_seeds: int) -> list[Line2D]:
     return [thin, Line2D([], [], color=INK, label="thick: their median")]
 
 
-def _finish(axes: Axes, letter: str, variable: str, descriptions: Mapping[str, str], zoom_from: int | None = None) -> None:
-    """Title, label and unit of a panel; the letter of a panel stands on its first axes only."""
-    words = descriptions.get(variable, "")
-    title = f"{words[:1].upper()}{words[1:]} {symbol(variable)}".strip()
-    if zoom_from is not None:
-        title = f"Zoom of {symbol(variable)} from sample {zoom_from}"
-    head(axes, letter, title, " ".join(part for part in (letter, variable, "" if zoom_from is None else "zoom") if part))
-    axes.set_ylabel(f"{symbol(variable)} ({DEVIATION})".replace(", ", ",\n"))
-    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True, steps=[1, 2, 5, 10]))
-
-
 def _legend(figure: Figure, response: pd.DataFrame, kinds: Sequence[str], agent_label: str, expert_label: str) -> None:
     """Every line and band of the figure, below its panels."""
     handles: list[Line2D | Patch] = [
@@ -380,22 +347,12 @@ def _legend(figure: Figure, response: pd.DataFrame, kinds: Sequence[str], agent_
         for kind in kinds
         for controller, label in (("agent", agent_label), ("expert", expert_label))
     ]
-    n_seeds = _n_seeds(response)
-    over = f", medians over {n_seeds} seeds" if n_seeds > 1 else ""
-    below = [Line2D([], [], linewidth=2, label="set point", **AIM)]
-    if n_seeds > 1:
+    below, over = [Line2D([], [], linewidth=2, label="set point", **AIM)], ""
+    if (n_seeds := _n_seeds(response)) > 1:
         below.append(Line2D([], [], color=INK, linewidth=THIN, label="thin lines: the mean of each seed"))
+        over = f", medians over {n_seeds} seeds"
     band = Patch(facecolor="#888888", alpha=0.35, label=f"line and band: {BAND}{over}")
     # A legend fills column by column: one for the outputs, one for the inputs, where there are both.
     handles = [*handles[:2], *below, *handles[2:], band]
     narrow: Any = {"fontsize": 8, "labelspacing": 0.2} if figure.get_figwidth() < WIDTH else {}
     figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False, **narrow)
-
-
-def _percent(share: float, position: int | None = None) -> str:
-    return f"{100 * share:.3g}"
-
-
-def _percent_of_few(share: float, position: int | None = None) -> str:
-    """Labels of the minor ticks of a decade: only those at 2 and 5 times a power of ten."""
-    return _percent(share) if f"{share:.0e}"[0] in "25" else ""

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from seaborn import heatmap
 
 from helpers.report.figures import INK, KIND_STYLES, LOOP_COLOURS, MUTED, WIDTH, empty_figure, head
-from helpers.report.tables import case_study
+from helpers.report.tables import capital, case_study
 
 LABELS = {
     "expert": "PID (demonstrator)",
@@ -46,9 +46,7 @@ THE_PAPERS = "irl_reinforce"
 RIVALS = ("clone_reinforce", "csil_reinforce", "scratch_reinforce", "ppo", "recurrent_ppo", "pid_tuned", "pid_scheduled")
 LEARNERS = (THE_PAPERS, "irl_alone", *RIVALS)  # the rivals need no model
 LEVELS = ("one_policy", "mpc", "minimum_variance", "expert", "dynamic_programme")
-DASHES = (*KIND_STYLES, (0, (6, 1, 1, 1, 1, 1)))
 RUNS = {"hot": "hot start", "cloned": "from the clone", "scratch": "from scratch"}
-NOTHING = "#c8c8c8"  # under a condition in which no controller earns anything
 GRIDS = {  # of each group of conditions: title, label of the rows, label of the columns
     "model": ("mismatch of the model", "A, times", "B, times"),
     "noise": ("disturbance and observation noise", "disturbance, times", "observation noise, times"),
@@ -58,11 +56,7 @@ GRIDS = {  # of each group of conditions: title, label of the rows, label of the
 
 
 def gap_figure(gaps: pd.DataFrame) -> Figure:
-    """The gap of every controller to the dynamic programme with its 95 % interval; a panel for each case.
-
-    Args:
-        gaps: columns case, controller, gap, gap_low, gap_high, in per cent.
-    """
+    """Gaps to the dynamic programme and 95 % intervals (columns case, controller, gap, gap_low, gap_high, in per cent), by case."""
     listed = [name for name in LABELS if name in set(gaps["controller"])][::-1]
     figure = empty_figure(WIDTH, 0.6 + 0.27 * len(listed))
     panels = np.atleast_1d(figure.subplots(1, gaps["case"].nunique(), sharey=True))
@@ -72,33 +66,24 @@ def gap_figure(gaps: pd.DataFrame) -> Figure:
         axes.errorbar(found["gap"], range(len(found)), xerr=reach, fmt="o", color=INK, markersize=4, label="gap and 95 % interval")
         axes.axvline(0, color=MUTED, linewidth=1)
         axes.set_yticks(range(len(found)), [LABELS[name] for name in listed])
-        axes.set_xlabel("gap to the programme (%)")
-        head(axes, letter, case_study(case), f"{letter} case {case}")
+        head(axes, letter, case_study(case), f"{letter} case {case}", xlabel="gap to the programme (%)")
     return figure
 
 
 def budget_curves(curves: pd.DataFrame, levels: Mapping[str, float]) -> Figure:
-    """The objective against the plant episodes spent, a line for each learner, beside those that do not learn.
+    """The objective against the plant episodes spent, a line for each learner, beside the `levels` of those that do not learn.
 
-    Args:
-        curves: columns learner, episodes, objective, and seed where there are several; the line is then the median and the band
-            around it holds the middle half of the seeds.
-        levels: objectives of controllers that do not learn.
+    `curves` has the columns learner, episodes, objective, and seed where there are several; the line is then the median and the
+    band around it holds the middle half of the seeds.
     """
     figure = empty_figure(WIDTH, 4.4)
-    _draw_budget(axes := figure.subplots(), curves, levels)
-    axes.set_label("budget")
+    _draw_budget(figure.add_subplot(label="budget"), curves, levels)
     figure.legend(loc="outside right upper", frameon=False)
     return figure
 
 
 def budget_by_case(curves: pd.DataFrame, levels: Mapping[int, Mapping[str, float]]) -> Figure:
-    """`budget_curves` of each case, side by side.
-
-    Args:
-        curves: with a column case.
-        levels: by case.
-    """
+    """`budget_curves` of each case, side by side; `curves` has a column case."""
     figure = empty_figure(WIDTH, 4.2)
     panels = np.atleast_1d(figure.subplots(1, len(levels)))
     for axes, (case, of_case) in zip(panels, levels.items(), strict=True):
@@ -120,20 +105,16 @@ def _draw_budget(axes: Axes, curves: pd.DataFrame, levels: Mapping[str, float]) 
         axes.plot(line.index, line, label=LABELS[name], markersize=4, color=colour, marker=marker, linestyle=dash)
         if (high > low).any():
             axes.fill_between(line.index, low, high, color=colour, alpha=0.15, linewidth=0)
-    for name, dash in zip([name for name in LEVELS if name in levels], DASHES, strict=False):
+    for name, dash in zip([name for name in LEVELS if name in levels], KIND_STYLES, strict=False):
         axes.axhline(levels[name], label=LABELS[name], color=MUTED, linestyle=dash, linewidth=1.2)
-    axes.set_xlabel("plant episodes spent")
-    axes.set_ylabel("tracking objective $J$ on $x$ (no unit)")
-    axes.set_ylim(bottom=0)
+    axes.set(xlabel="plant episodes spent", ylabel="tracking objective $J$ on $x$ (no unit)", ylim=(0, None))
 
 
 def heat_maps(robustness: pd.DataFrame, group: str, controllers: Sequence[str]) -> Figure:
     """A heat map for each controller: its objective under every condition, coloured by what it has ahead of the PID.
 
     The colour is the difference to the PID's objective in per cent of the best controller's there; grey: none earns anything.
-
-    Args:
-        robustness: columns group, row, column, controller, objective.
+    `robustness` has the columns group, row, column, controller, objective.
     """
     title, row_label, column_label = GRIDS[group]
     found, across = robustness[robustness["group"] == group], 3
@@ -149,25 +130,19 @@ def heat_maps(robustness: pd.DataFrame, group: str, controllers: Sequence[str]) 
         values = table.loc[name].loc[rows, columns]
         look: Any = {"cmap": colours, "norm": norm, "cbar": False, "annot_kws": {"fontsize": 7.5}}
         heatmap(100 * (values - reference) / best, annot=values, fmt=".1f", ax=axes, **look)
-        axes.set(xlabel="", ylabel="", facecolor=NOTHING)
+        axes.set(xlabel="", ylabel="", facecolor="#c8c8c8", label=f"{name} {group}")  # grey, where no controller earns anything
         axes.tick_params(labelbottom=index >= len(controllers) - across, labelleft=index % across == 0, labelrotation=0)
         axes.set_title(LABELS[name], fontsize=9, loc="left")
-        axes.set_label(f"{name} {group}")
     figure.supxlabel(column_label, fontsize=10)
     figure.supylabel(row_label, fontsize=10)
-    bar = figure.colorbar(ScalarMappable(norm, colours), ax=figure.axes, shrink=0.8, aspect=30)
-    bar.set_label("$J$ less the PID's, % of the best there")
-    figure.suptitle(f"{title[:1].upper()}{title[1:]}: $J$ on $x$ of each controller", fontsize=10.5, x=0.02, ha="left")
+    label = "$J$ less the PID's, % of the best there"
+    figure.colorbar(ScalarMappable(norm, colours), ax=figure.axes, shrink=0.8, aspect=30, label=label)
+    figure.suptitle(f"{capital(title)}: $J$ on $x$ of each controller", fontsize=10.5, x=0.02, ha="left")
     return figure
 
 
 def robustness_figure(shares: pd.DataFrame, groups: Mapping[str, str]) -> Figure:
-    """The least share of the PID's objective over each grid of conditions: a panel for each case, a row for each controller.
-
-    Args:
-        shares: `limits_report.worst`: columns case, seed, controller, group, value (per cent).
-        groups: words for the grids.
-    """
+    """The shares of `limits_report.worst`, a panel for each case, a row for each controller; `groups` are words for the grids."""
     names = [name for name in LABELS if name in set(shares["controller"])]
     heights = pd.Series(range(0, -len(names), -1), names)
     figure = empty_figure(WIDTH, 1.2 + 0.24 * len(names))
@@ -179,9 +154,7 @@ def robustness_figure(shares: pd.DataFrame, groups: Mapping[str, str]) -> Figure
                 found = medians[group].dropna()
                 axes.plot(found, heights[found.index], label=words, color=colour, marker=shape, markersize=5, linestyle="")
         axes.axvline(100, color=MUTED, linewidth=1, linestyle=KIND_STYLES[1])
-        head(axes, "", case_study(case), f"case {case}")
-        axes.set_xlabel("% of the PID's $J$ there")
-        axes.set_xlim(left=0)
+        head(axes, "", case_study(case), f"case {case}", xlabel="% of the PID's $J$ there", xlim=(0, None))
     panels[0].set_yticks(heights, [LABELS[name] for name in names])
     figure.legend(handles=panels[0].lines[: len(set(shares["group"]))], loc="outside lower center", ncols=4, frameon=False)
     return figure
@@ -190,8 +163,7 @@ def robustness_figure(shares: pd.DataFrame, groups: Mapping[str, str]) -> Figure
 def regret_figure(episodes: pd.DataFrame) -> Figure:
     """What exploring costs beside the PID: the dip at the onset, the worst episode of each epoch, and the cumulative regret.
 
-    Args:
-        episodes: columns run, epoch, episode, objective, expert.
+    `episodes` has the columns run, epoch, episode, objective, expert.
     """
     figure = empty_figure(WIDTH, 3.8)
     dip, left, right = figure.subplots(1, 3)
@@ -210,6 +182,6 @@ def regret_figure(episodes: pd.DataFrame) -> Figure:
     left.set(xlabel="epoch", ylabel="$J$ of the worst episode (no unit)")
     right.set(xlabel="plant episode", ylabel="cumulative regret\nagainst the PID (no unit)")
     for axes, letter, name in ((dip, "A", "dip at the onset"), (left, "B", "worst episode"), (right, "C", "regret")):
-        head(axes, letter, f"{name[:1].upper()}{name[1:]}", f"{letter} {name}")
+        head(axes, letter, capital(name), f"{letter} {name}")
     figure.legend(handles=left.lines, loc="outside lower center", ncols=4, frameon=False)
     return figure

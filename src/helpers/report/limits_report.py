@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 from helpers.report import limits_figures, scorecard
 from helpers.report.collection import Results, stacked
 from helpers.report.limits_figures import GRIDS, LABELS, RIVALS, RUNS, THE_PAPERS
-from helpers.report.tables import NOT_KNOWN, ROMAN, spread, symbol
+from helpers.report.tables import NOT_KNOWN, ROMAN, capital, spread, symbol
 from helpers.settings.paper import Params
 
 PLACES = 4  # digits after the point that count
@@ -21,27 +21,23 @@ WITHOUT_THE_PLANT = {  # columns of notebook 09's summary, all shares of minimum
     "Least at corners of the models, %": "corners, least",
 }
 NEVER = 1e9  # stands for a time that a response never came to, so that it counts as long
-# Of each table of control quality its figures: header with unit, factor, digits after the point.
-QUALITY: dict[str, dict[str, tuple[str, int, int]]] = {
-    "errors": {
-        "ise": ("ISE (time)", 1, 3),
-        "iae": ("IAE (time)", 1, 3),
-        "itae": ("ITAE (time²)", 1, 3),
-        "iae_worst": ("IAE, worst 5 % (time)", 1, 3),
-    },
-    "response": {
-        "offset": ("Offset (%)", 100, 1),
-        "overshoot": ("Overshoot (%)", 100, 1),
-        "rise_time": ("Rise 10-90 % (time)", 1, 2),
-        "settling_time_2": ("Settling, 2 % (time)", 1, 2),
-        "settling_time_5": ("Settling, 5 % (time)", 1, 2),
-    },
-    "inputs": {
-        "total_variation": ("Total variation (deviation)", 1, 0),
-        "at_bound": ("At a bound (% of time)", 100, 1),
-        "harris": ("Harris index", 1, 2),
-    },
-}
+QUALITY = pd.DataFrame(  # of each figure of control quality the table that shows it, and how
+    [
+        ("ise", "errors", "ISE (time)", 1, 3),
+        ("iae", "errors", "IAE (time)", 1, 3),
+        ("itae", "errors", "ITAE (time²)", 1, 3),
+        ("iae_worst", "errors", "IAE, worst 5 % (time)", 1, 3),
+        ("offset", "response", "Offset (%)", 100, 1),
+        ("overshoot", "response", "Overshoot (%)", 100, 1),
+        ("rise_time", "response", "Rise 10-90 % (time)", 1, 2),
+        ("settling_time_2", "response", "Settling, 2 % (time)", 1, 2),
+        ("settling_time_5", "response", "Settling, 5 % (time)", 1, 2),
+        ("total_variation", "inputs", "Total variation (deviation)", 1, 0),
+        ("at_bound", "inputs", "At a bound (% of time)", 100, 1),
+        ("harris", "inputs", "Harris index", 1, 2),
+    ],
+    columns=["figure", "table", "header", "factor", "decimals"],
+).set_index("figure")
 SAFETY = {  # of the online epochs, with their units
     "episodes": "Episodes",
     "worst": "Worst episode ($J$)",
@@ -69,24 +65,22 @@ def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     gaps = read(results, "attainable", "gaps.csv")
     if gaps.empty:
         return {}
-    budget = read(results, "budget", "curves.csv").rename(columns={"learner": "controller", "objective": "value"})
-    listed = listed_budgets(results)
-    pairs, shares = ahead(listed), worst(results)
+    listed, shares = listed_budgets(results), worst(results)
+    pairs = ahead(listed).assign(metric=lambda rows: rows["metric"].map("after {:,}".format))
     there = on_mismatch(results).rename(columns={"plant": "metric", "objective": "value"})
     quality = read(results, "quality", "quality.csv").rename(columns={"figure": "metric"})
-    safety = read(results, "safety", "safety.csv").rename(columns={"run": "controller"})
-    safety = safety.rename(columns=SAFETY).melt(["case", "seed", "controller"], var_name="metric")
-    pairs = _wide(pairs.assign(metric=pairs["metric"].map("after {:,}".format)), decimals=2)
+    safety = read(results, "safety", "safety.csv").rename(columns={"run": "controller"} | SAFETY)
     return {
         "limits_gaps": _gaps(gaps),
         "limits_attainable": _attainable(gaps),
         "limits_budget": _budget(listed),
-        "limits_pairs": pairs.rename(columns={"controller": "rival"}),
+        "limits_pairs": _wide(pairs, decimals=2).rename(columns={"controller": "rival"}),
         "limits_robustness": _wide(shares.assign(metric=shares["group"].map(GROUPS)), decimals=0),
         "limits_improved": _wide(there, decimals=1),
-        **{f"limits_{table}": _quality(quality, figures) for table, figures in QUALITY.items()},
-        "limits_safety": _wide(safety, RUNS),
-    } | ({"limits_curves": budget} if len(budget) else {})
+        **{f"limits_{table}": _quality(quality, table) for table in ("errors", "response", "inputs")},
+        "limits_safety": _wide(safety.melt(["case", "seed", "controller"], var_name="metric")),
+        "limits_curves": read(results, "budget", "curves.csv").rename(columns={"learner": "controller", "objective": "value"}),
+    }
 
 
 def without_the_plant(results: Results) -> dict[str, pd.DataFrame]:
@@ -104,7 +98,7 @@ def without_the_plant(results: Results) -> dict[str, pd.DataFrame]:
         figures, place = ["mean |e|", "movement"], ["seed", "controller"]
         means = results.own_plant.groupby(place, sort=False)[figures].mean()
         shares = (100 * means / means.xs("PID of the record", level="controller")).groupby("controller", sort=False).median()
-        table = shares.map("{:.0f}".format).rename(columns=lambda name: f"{name[:1].upper()}{name[1:]}, % of the record's PID")
+        table = shares.map("{:.0f}".format).rename(columns=lambda name: f"{capital(name)}, % of the record's PID")
         offsets = results.own_plant.groupby(place, sort=False)["offset"].max().groupby("controller", sort=False).median()
         found["own_plant"] = table.assign(**{"Greatest offset, % of the range": (100 * offsets).map("{:.1f}".format)}).reset_index()
     return found
@@ -167,24 +161,20 @@ def summary(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _gaps(gaps: pd.DataFrame) -> pd.DataFrame:
     """A row for each controller, a column for each case: the gap to the programme in per cent."""
-    columns: dict[str, dict[str, str]] = {}
-    for case, rows in _with_interval(gaps, "gap", ("gap_low", "gap_high")).groupby("case"):
-        found = rows.set_index("controller")
-        columns[ROMAN[case - 1]] = {name: spread(row, decimals=1) for name, row in found.iterrows()}
-    table = pd.DataFrame(columns)
+    found = _with_interval(gaps, "gap", ("gap_low", "gap_high"))
+    found = found.assign(cell=[spread(row, decimals=1) for _, row in found.iterrows()])
+    table = found.pivot_table(index="controller", columns="case", values="cell", aggfunc="first").rename_axis(columns=None)
     table = table.reindex([name for name in LABELS if name in table.index])
-    return table.rename(index=LABELS).rename_axis("controller").reset_index()
+    return table.rename(index=LABELS, columns=lambda case: ROMAN[case - 1]).reset_index()
 
 
 def _attainable(gaps: pd.DataFrame) -> pd.DataFrame:
     """The objective of the controllers that know the process: a row for each case and controller."""
     known = [name for name in LABELS if name.startswith(("minimum_variance", "dynamic_programme"))]
     found = _with_interval(gaps, "objective", ("low", "high")).set_index(["case", "controller"])
-    rows = [
-        {"case": ROMAN[case - 1], "controller": LABELS[name], "$J$": spread(found.loc[(case, name)], decimals=2)}
-        for case, name in product(sorted(gaps["case"].unique()), known)
-    ]
-    return pd.DataFrame(rows)
+    places = list(product(sorted(gaps["case"].unique()), known))
+    rows = [(ROMAN[case - 1], LABELS[name], spread(found.loc[(case, name)], decimals=2)) for case, name in places]
+    return pd.DataFrame(rows, columns=["case", "controller", "$J$"])
 
 
 def _with_interval(gaps: pd.DataFrame, name: str, ends: tuple[str, str]) -> pd.DataFrame:
@@ -207,11 +197,7 @@ def _budget(listed: pd.DataFrame) -> pd.DataFrame:
 
 
 def ahead(listed: pd.DataFrame) -> pd.DataFrame:
-    """How far the paper's learner is ahead of each rival within a seed: columns case, seed, metric (the budget), controller, value.
-
-    Args:
-        listed: columns case, seed, learner, metric (the budget), value.
-    """
+    """How far the paper's learner is ahead of each rival at each of `listed_budgets`: case, seed, metric, controller, value."""
     wide = listed.astype({"metric": int}).pivot_table(index=["case", "seed", "metric"], columns="learner", values="value")
     rivals = [name for name in RIVALS if name in wide and THE_PAPERS in wide]
     return wide[rivals].rsub(wide.get(THE_PAPERS), axis=0).melt(ignore_index=False, var_name="controller").reset_index().dropna()
@@ -219,21 +205,20 @@ def ahead(listed: pd.DataFrame) -> pd.DataFrame:
 
 def listed_budgets(results: Results) -> pd.DataFrame:
     """The objective at the listed budgets: columns case, seed, learner, metric (the budget), value."""
-    budget = read(results, "budget", "budget.csv")
-    return budget.melt(["case", "seed", "learner"], var_name="metric") if len(budget) else budget
+    return read(results, "budget", "budget.csv").melt(["case", "seed", "learner"], var_name="metric")
 
 
-def _wide(frame: pd.DataFrame, names: Mapping[str, str] = LABELS, decimals: int | Mapping[str, int] | None = None) -> pd.DataFrame:
+def _wide(frame: pd.DataFrame, decimals: int | Mapping[str, int] | None = None) -> pd.DataFrame:
     """Medians of long rows (case, seed, controller, metric, value): a row for each case and controller, a column a metric."""
     found = summary(frame.assign(value=frame["value"].round(PLACES))).set_index(["case", "stage", "metric"])  # 1e-90 is nought
+    names = {name: words for name, words in (LABELS | RUNS).items() if name in set(frame["controller"])}
     rows = []
     for case, name in product(sorted(frame["case"].unique()), names):
-        if name in set(frame["controller"]):
-            row = {"case": ROMAN[case - 1], "controller": names[name]}
-            for metric in frame["metric"].unique():
-                places = decimals[metric] if isinstance(decimals, Mapping) else decimals
-                row[metric] = _cell(found.reindex([(case, name, metric)]).iloc[0], places)
-            rows.append(row)
+        row = {"case": ROMAN[case - 1], "controller": names[name]}
+        for metric in frame["metric"].unique():
+            places = decimals[metric] if isinstance(decimals, Mapping) else decimals
+            row[metric] = _cell(found.reindex([(case, name, metric)]).iloc[0], places)
+        rows.append(row)
     return pd.DataFrame(rows)
 
 
@@ -246,28 +231,21 @@ def _cell(numbers: pd.Series, decimals: int | None) -> str:
     return spread(numbers, decimals=decimals)
 
 
-def _quality(quality: pd.DataFrame, figures: Mapping[str, tuple[str, int, int]]) -> pd.DataFrame:
-    """Some figures of control quality, a column for each figure and variable; what a seed never reached counts as long.
+def _quality(quality: pd.DataFrame, table: str) -> pd.DataFrame:
+    """The figures of control quality of a table, a column for each and each variable; what a seed never reached counts as long.
 
-    Args:
-        quality: columns case, seed, controller, metric (figure:variable), value.
-        figures: header with its unit, factor and digits after the point by figure.
+    `quality` has the columns case, seed, controller, metric (figure:variable), value.
     """
-    parts = quality["metric"].str.partition(":")
-    rows = quality.assign(figure=parts[0], variable=parts[2])[parts[0].isin(figures)]
-    factors = [figures[figure][1] for figure in rows["figure"]]
     place = ["case", "seed", "controller", "variable"]
-    rises = quality.assign(variable=parts[2])[(parts[0] == "rise_time") & quality["value"].notna()]
+    rows = quality.join(quality["metric"].str.partition(":").set_axis(["figure", ":", "variable"], axis=1))
+    rises = rows[(rows["figure"] == "rise_time") & rows["value"].notna()]
+    rows = rows.join(QUALITY, on="figure", how="inner").query("table == @table")
     arrived = pd.MultiIndex.from_frame(rows[place]).isin(pd.MultiIndex.from_frame(rises[place]))
     overshoots = (rows["figure"] == "overshoot") & ~arrived  # what never comes near the set point overshoots by no number
-    rows["value"] = (rows["value"] * factors).mask(overshoots).fillna(NEVER)
-    headers, decimals = {}, {}
-    for row in rows.drop_duplicates("metric").itertuples():
-        header, _, places = figures[row.figure]
-        words, bracket, unit = header.partition(" (")
-        headers[row.metric] = f"{words}, {symbol(row.variable)}{bracket}{unit}"
-        decimals[headers[row.metric]] = places
-    return _wide(rows.assign(metric=rows["metric"].map(headers)), decimals=decimals)
+    header = rows["header"].str.partition(" (")
+    names = header[0] + ", " + rows["variable"].map(symbol) + header[1] + header[2]
+    rows = rows.assign(metric=names, value=(rows["value"] * rows["factor"]).mask(overshoots).fillna(NEVER))
+    return _wide(rows, decimals=rows.set_index("metric")["decimals"].to_dict())
 
 
 def draw(results: Results) -> dict[str, Figure]:
@@ -283,17 +261,16 @@ def draw(results: Results) -> dict[str, Figure]:
         "limits_gaps": limits_figures.gap_figure(ends),
         "limits_robustness": limits_figures.robustness_figure(worst(results), GROUPS),
     }
-    robust, place = read(results, "robustness", "robustness.csv"), ["group", "row", "column", "controller"]
-    for name in heat_map_names(results):
-        group, _, case = name.removeprefix("limits_").rpartition("_case_")
-        cells = robust[robust["case"] == int(case)].groupby(place, as_index=False, sort=False)["objective"].median()
+    place = ["group", "row", "column", "controller"]
+    for (case, group), robust in read(results, "robustness", "robustness.csv").groupby(["case", "group"]):
+        cells = robust.groupby(place, as_index=False, sort=False)["objective"].median()
         shown = [controller for controller in cells["controller"].unique() if controller not in LIKE_OTHERS]
-        drawn[name] = limits_figures.heat_maps(cells, group, shown)
+        drawn[f"limits_{group}_case_{case}"] = limits_figures.heat_maps(cells, group, shown)
     return drawn
 
 
 def heat_map_names(results: Results) -> list[str]:
     """The heat maps that there are, by grid and case."""
     robust = read(results, "robustness", "robustness.csv").reindex(columns=["case", "group"])
-    found = robust.drop_duplicates().astype({"case": int}).itertuples(index=False, name=None)
-    return [f"limits_{group}_case_{case}" for case, group in sorted(found, key=lambda place: (place[0], [*GRIDS].index(place[1])))]
+    found = set(robust.itertuples(index=False, name=None))
+    return [f"limits_{group}_case_{case}" for case in results.params for group in GRIDS if (case, group) in found]

@@ -7,9 +7,8 @@ from IPython.display import display
 from matplotlib.figure import Figure
 
 from helpers.learning.policy import LSTMPolicy
-from helpers.plant.controllers import Controller
 from helpers.plant.task import Trajectories
-from helpers.report.figures import BAND, BAND_OPACITY, LOOP_COLOURS, SET_POINT, TIME_LABEL, WIDTH, empty_figure, symbol
+from helpers.report.figures import BAND, BAND_OPACITY, LOOP_COLOURS, SET_POINT, TIME_LABEL, WIDTH, empty_figure, head, symbol
 from helpers.runs.study import Study
 from helpers.settings.leaf import DEVIATION
 
@@ -34,8 +33,8 @@ def elsewhere(study: Study, set_point: Sequence[float], disturbance: float = 1.0
 
 def runs(study: Study, policies: Mapping[str, LSTMPolicy]) -> dict[str, Trajectories]:
     """Trajectories of the PID and of each policy, which all meet the same disturbances, by name."""
-    controllers: dict[str, Controller | LSTMPolicy] = {"PID": study.expert, **policies}
-    return {name: study.fresh(controller, N_TRAJECTORIES) for name, controller in controllers.items()}
+    expert = {"PID": study.fresh(study.expert, N_TRAJECTORIES)}
+    return expert | {name: study.fresh(policy, N_TRAJECTORIES) for name, policy in policies.items()}
 
 
 def objectives(study: Study, policies: Mapping[str, LSTMPolicy]) -> dict[str, float]:
@@ -58,9 +57,7 @@ def side_by_side(study: Study, policies: Mapping[str, LSTMPolicy]) -> Figure:
                 axes.plot(mean, color=colour, label=label)
             if kind == "x":
                 axes.axhline(study.params.case.set_point[loop], color=SET_POINT, linestyle=":", label="set point")
-            axes.set_title(symbol(name), loc="left")
-            axes.set_ylabel(DEVIATION.replace(", ", ",\n"))
-            axes.set_label(name)
+            head(axes, "", symbol(name), name, ylabel=DEVIATION.replace(", ", ",\n"))
     lines = grid[0, 0].lines
     figure.supxlabel(TIME_LABEL)
     figure.legend(handles=lines, loc="outside upper center", ncols=len(lines), frameon=False)
@@ -72,16 +69,12 @@ def panel(study: Study, policies: Mapping[str, LSTMPolicy]) -> widgets.VBox:
     process = study.params.process
     words = dict(zip(process.controlled, process.controlled_description, strict=True))
     style = {"continuous_update": False, "style": {"description_width": "11em"}, "layout": {"width": "30em"}}
-    sliders = {
-        name: widgets.FloatSlider(
-            value, min=-2 * abs(value), max=2 * abs(value), step=abs(value) / 10, description=words[name], **style
-        )
-        for name, value in zip(process.controlled, study.params.case.set_point, strict=True)
-    }
-    factors = {
-        name: widgets.FloatSlider(1.0, min=0.0, max=4.0, step=0.25, description=f"{what} ×", **style)
-        for name, what in (("disturbance", "disturbance"), ("noise", "observation noise"))
-    }
+    sliders, factors = {}, {}
+    for name, value in zip(process.controlled, study.params.case.set_point, strict=True):
+        ends = {"min": -2 * abs(value), "max": 2 * abs(value), "step": abs(value) / 10}
+        sliders[name] = widgets.FloatSlider(value, description=words[name], **ends, **style)
+    for name, what in (("disturbance", "disturbance"), ("noise", "observation noise")):
+        factors[name] = widgets.FloatSlider(1.0, min=0.0, max=4.0, step=0.25, description=f"{what} ×", **style)
 
     def show(disturbance: float, noise: float, **set_point: float) -> None:
         display(side_by_side(elsewhere(study, list(set_point.values()), disturbance, noise), policies))

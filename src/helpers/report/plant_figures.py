@@ -22,28 +22,20 @@ from helpers.own_plant.identify import Validation
 from helpers.own_plant.learn import Workshop
 from helpers.own_plant.quality import CleanRecords
 from helpers.plant.tracking import Tracker, track
-from helpers.report.figures import AIM, COLOURS, INK, LINE_STYLES, LOOP_COLOURS, WIDTH, empty_figure
-from helpers.report.tables import symbol
+from helpers.report.figures import AIM, COLOURS, INK, LINE_STYLES, LOOP_COLOURS, WIDTH, empty_figure, head
+from helpers.report.tables import capital, symbol
 
 MEASURED, SIMULATED = COLOURS["controlled", "expert"], COLOURS["controlled", "agent"]
 SHADES = {"left out": "#d9d9d9", "not in automatic": "#fde0b5"}
 MODE_SHADES = {"manual": SHADES["not in automatic"], "hold": SHADES["left out"], "PID": "#d5ecd4"}
 CANDIDATES = ("#6e6e6e", LOOP_COLOURS[4], LOOP_COLOURS[2], LOOP_COLOURS[0])  # in the order of `gate.SIMPLEST`
 SHARES = {"mean |e|": "mean |e|, share of the record's PID's", "movement": "movement, share of the record's PID's"}
-CURVES = {
-    "cost": "cost (no unit)",
-    "movement": "movement (share of what is allowed)",
-    "price": "price on movement (no unit)",
-}
+CURVES = {"cost": "cost (no unit)", "movement": "movement (share of what is allowed)", "price": "price on movement (no unit)"}
 MOST_POINTS = 4000  # of a line: more cannot be told apart on a page
 
 
 def quality_figure(clean: CleanRecords, description: PlantDescription, first: int = 0, n_samples: int | None = None) -> Figure:
-    """A record after its repair, a panel for each variable; engineering units.
-
-    Args:
-        first, n_samples: which samples; all of them without. A long record is thinned out evenly.
-    """
+    """A record after its repair from sample `first` on, a panel for each variable; engineering units; a long one is thinned out."""
     table = clean.table.iloc[first : None if n_samples is None else first + n_samples]
     table = table.iloc[:: max(1, len(table) // MOST_POINTS)]
     where = {"left out": table["segment"] < 0, "not in automatic": ~table["automatic"]}
@@ -56,9 +48,8 @@ def quality_figure(clean: CleanRecords, description: PlantDescription, first: in
         _shade(axis, SHADES, where)
     axis.set_xlim(*table.index[[0, -1]])
     axis.xaxis.set_major_locator(MaxNLocator(8, integer=True))
-    _legend(
-        figure, [*(Patch(color=shade, label=label) for label, shade in SHADES.items()), Line2D([], [], label="set point", **AIM)]
-    )
+    shades = [Patch(color=shade, label=label) for label, shade in SHADES.items()]
+    _legend(figure, [*shades, Line2D([], [], label="set point", **AIM)])
     return figure
 
 
@@ -85,26 +76,22 @@ def gate_figure(verdict: Verdict) -> Figure:
     figure = empty_figure(WIDTH, 3.4)
     frame, order = verdict.models[verdict.models["controller"] != RECORD], [name for name in SIMPLEST if name != RECORD]
     for axis, (what, label) in zip(figure.subplots(1, 2), SHARES.items(), strict=True):
-        seaborn.boxenplot(
-            frame, x=what, y="controller", hue="controller", order=order, hue_order=order, palette=list(CANDIDATES[1:]),
-            legend=False, ax=axis,
-        )  # fmt: skip
+        look = {"order": order, "hue": "controller", "hue_order": order, "palette": list(CANDIDATES[1:]), "legend": False}
+        seaborn.boxenplot(frame, x=what, y="controller", ax=axis, **look)
         axis.axvline(1.0, color=INK, linewidth=1.0, linestyle="--")
-        axis.set_xlabel(label)
-        axis.set_ylabel("")
+        axis.set(xlabel=label, ylabel="")
     return figure
 
 
 def progress_figure(records: Sequence[GradientRecord]) -> Figure:
     """Over the gradient steps the cost (mean |e|, a share of the record's PID's, any excess many times), movement and its price."""
-    frame = pd.DataFrame([vars(record) for record in records]).rename(columns=CURVES)
+    frame = pd.DataFrame([vars(record) for record in records])
     figure = empty_figure(WIDTH, 3.0)
-    for axis, (name, level) in zip(figure.subplots(1, 3), zip(CURVES.values(), (1.0, 1.0, None), strict=True), strict=True):
-        axis.plot(frame.index + 1, frame[name], color=SIMULATED, linewidth=1.0, label=name)
-        if level is not None:
-            axis.axhline(level, color=INK, linewidth=1.0, linestyle="--", label="the record's PID, or what it allows")
-        axis.set_title(name, loc="left")
-        axis.set_xlabel("gradient step")
+    for axis, (column, name) in zip(figure.subplots(1, 3), CURVES.items(), strict=True):
+        axis.plot(frame.index + 1, frame[column], color=SIMULATED, linewidth=1.0, label=name)
+        if column != "price":
+            axis.axhline(1.0, color=INK, linewidth=1.0, linestyle="--", label="the record's PID, or what it allows")
+        head(axis, "", name, name, xlabel="gradient step")
     return figure
 
 
@@ -117,19 +104,16 @@ def validation_figure(validation: Validation, description: PlantDescription) -> 
     for index, (variable, (left, right)) in enumerate(zip(variables, axes, strict=True)):
         left.plot(measured[:, index], color=MEASURED, linestyle=LINE_STYLES["expert"], label="measured")
         left.plot(simulated[:, index], color=SIMULATED, label="simulated from the inputs")
-        words = f"fit {100 * validation.fit[index]:.0f} % over {len(validation.measured)} windows"
-        left.set_title(f"{symbol(variable.name)}: {words}", loc="left")
-        left.set_ylabel(f"deviation ({variable.unit})")
+        title = f"{symbol(variable.name)}: fit {100 * validation.fit[index]:.0f} % over {len(validation.measured)} windows"
+        head(left, "", title, f"{variable.name} simulated", ylabel=f"deviation ({variable.unit})")
         values, reach = acf(validation.residuals[index], nlags=20)[1:], 1.96 / len(validation.residuals[index]) ** 0.5
         right.axhspan(-reach, reach, color=SHADES["left out"], label="95 % of white noise")
         lags = np.arange(1, len(values) + 1)
         right.bar(lags, values, width=0.2, color=INK)
         right.plot(lags, values, "o", color=INK, markersize=3, label="autocorrelation")
-        right.set_title(f"{symbol(variable.name)}: residuals, Ljung-Box p = {validation.p_value[index]:.2g}", loc="left")
-        right.set_ylabel("autocorrelation (no unit)")
+        title = f"{symbol(variable.name)}: residuals, Ljung-Box p = {validation.p_value[index]:.2g}"
+        head(right, "", title, f"{variable.name} residuals", ylabel="autocorrelation (no unit)")
         right.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-        left.set_label(f"{variable.name} simulated")
-        right.set_label(f"{variable.name} residuals")
     axes[-1, 0].set_xlabel("sample of the window")
     axes[-1, 1].set_xlabel("lag (samples)")
     _legend(figure, [handle for axis in axes[0] for handle in axis.get_legend_handles_labels()[0]], 4)
@@ -139,8 +123,7 @@ def validation_figure(validation: Validation, description: PlantDescription) -> 
 def guard_figure(steps: pd.DataFrame, description: PlantDescription) -> Figure:
     """A guarded policy sample by sample, a panel for each variable; engineering units. The shade says who sets the inputs.
 
-    Args:
-        steps: a row a sample; columns mode, a name for each variable, and `<name>_sp` for the set points.
+    `steps` has a row a sample; columns mode, a name for each variable, and `<name>_sp` for the set points.
     """
     here = {mode: steps["mode"].eq(mode) for mode in MODE_SHADES}
     where = {mode: mask | mask.shift(fill_value=False) for mode, mask in here.items()}
@@ -155,23 +138,15 @@ def guard_figure(steps: pd.DataFrame, description: PlantDescription) -> Figure:
     return figure
 
 
-def _panels(
-    description: PlantDescription, each: float, beside: float
-) -> tuple[Figure, list[tuple[Axes, Variable, dict[str, Any]]]]:
-    """A panel for each variable, one below the other, with the look of its line: an input is held until the next sample.
-
-    Args:
-        each, beside: inches, of a panel and of what is around them.
-    """
+def _panels(description: PlantDescription, each: float, beside: float) -> tuple[Figure, list[tuple[Axes, Variable, Any]]]:
+    """A panel for each variable, `each` inches high, with the look of its line: an input is held until the next sample."""
     variables: list[Variable] = [*description.controlled, *description.manipulated]
     figure = empty_figure(WIDTH, each * len(variables) + beside)
     axes = figure.subplots(len(variables), 1, sharex=True, squeeze=False)[:, 0]
     looks = []
     for axis, variable in zip(axes, variables, strict=True):
-        words = variable.description or variable.name
-        axis.set_title(f"{words[:1].upper()}{words[1:]} ({variable.tag})", loc="left")
-        axis.set_ylabel(variable.unit)
-        axis.set_label(variable.name)
+        words = capital(variable.description or variable.name)
+        head(axis, "", f"{words} ({variable.tag})", variable.name, ylabel=variable.unit)
         held = variable not in description.controlled
         colour = COLOURS["manipulated" if held else "controlled", "agent"]
         looks.append({"color": colour, "drawstyle": "steps-post" if held else "default"})

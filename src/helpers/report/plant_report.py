@@ -8,8 +8,8 @@ import argparse
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 import torch
@@ -38,6 +38,7 @@ from helpers.own_plant.online import improve_on_plant
 from helpers.plant.tracking import track
 from helpers.report.figures import DPI_FILE
 from helpers.report.plant_figures import gate_figure, loops_figure, progress_figure, quality_figure, validation_figure
+from helpers.report.tables import capital
 from helpers.runs.request import check_place
 from helpers.runs.scratch import beside, sweep
 from helpers.runs.sources import PROJECT
@@ -49,8 +50,7 @@ MEANINGLESS = 10.0  # a relative feature gap beyond which a feature of the recor
 NAMES = ("policy.onnx", f"policy{STATIC}.onnx", "policy.c", "report.md")  # what the command writes beside its figures
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """What the command found; tables and figures by name, and the sentences of the report, the verdict first."""
 
     tables: dict[str, pd.DataFrame]
@@ -76,20 +76,15 @@ def notes(workshop: Workshop) -> dict[str, object]:
 
 
 def export_policy(workshop: Workshop, policy: TrackingPolicy, folder: Path) -> float:
-    """Write policy.onnx, the same with batch 1 and fixed shapes, and as C source; the greatest disagreement with torch.
+    """Write policy.onnx, the same with batch 1 and fixed shapes, and as C source.
 
-    Returns:
-        Over whole episodes, as a share of the input range.
-
-    Raises:
-        InputError: if file and policy disagree.
+    Returns the greatest disagreement with torch over whole episodes, as a share of the input range; InputError if they disagree.
     """
     description = workshop.plant.description
     steady = description.steady("controlled"), description.steady("manipulated")
     paths = [folder / name for name in NAMES[:3]]
-    for path, static in zip(paths, (False, True), strict=False):
-        export(policy, *steady, path, notes(workshop), static)
-    export_c(paths[1], paths[2])
+    export(policy, *steady, paths[0], notes(workshop))
+    export_c(export(policy, *steady, paths[1], notes(workshop), static=True), paths[2])
     scenarios = workshop.draw(workshop.held_out, 20, workshop.plant.stream("export"))
     with torch.no_grad():
         run = track(policy, scenarios, workshop.operation.bounds)
@@ -107,9 +102,8 @@ def offline(plant: OwnPlant, workshop: Workshop) -> tuple[dict[str, pd.DataFrame
         study, found = learn_offline(plant, model, task_on(plant, model))
     except (InputError, TrainingError) as error:
         return {}, [f"the weights of the record's controller were not found: {error}"]
-    told = [
-        f"{shown.trajectories.n_trajectories} episodes of {plant.description.horizon} samples show what the record's PID is after"
-    ]
+    total, horizon = shown.trajectories.n_trajectories, plant.description.horizon
+    told = [f"{total} episodes of {horizon} samples show what the record's PID is after"]
     told += [f"left out: {number} episodes ({reason})" for reason, number in shown.left_out.items() if number]
     if (gap := min(record.feature_gap for record in found.records)) > MEANINGLESS:
         why = "a feature of the record is next to zero, its variable is far from its set point"
@@ -119,10 +113,9 @@ def offline(plant: OwnPlant, workshop: Workshop) -> tuple[dict[str, pd.DataFrame
 
 
 def work(path: Path, folder: Path, params_root: Path, scale: str, seed: int) -> tuple[str, Outcome]:
-    """The whole chain for one description; policy files go into `folder`. Returns the title and what was found.
+    """The whole chain for one description: its title and what was found; policy files go into `folder`.
 
-    Raises:
-        InputError: in one sentence, if something that was given cannot be used. OSError: if `folder` cannot be written.
+    What cannot be used is refused by an InputError in one sentence; OSError if `folder` cannot be written.
     """
     params = load(params_root, 1)
     torch.set_num_threads(params.learning.scales[scale].threads)
@@ -185,7 +178,7 @@ def run(path: Path, output: Path, params_root: Path, scale: str, seed: int) -> O
 def write(outcome: Outcome, title: str, output: Path) -> None:
     """report.md with its figures beside it; the first line is the verdict."""
     verdict, *others = outcome.sentences
-    parts = [f"**{verdict[:1].upper()}{verdict[1:]}.**", "", f"# {title}", "", *(f"- {sentence}" for sentence in others)]
+    parts = [f"**{capital(verdict)}.**", "", f"# {title}", "", *(f"- {sentence}" for sentence in others)]
     for name, table in outcome.tables.items():
         parts += ["", f"## {name}", "", table.to_markdown(floatfmt=".4g", index=name != "Data quality")]
     for name, figure in outcome.figures.items():

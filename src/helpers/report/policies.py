@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
-from torch.nn import functional
 
 from helpers.learning.policy import RELU6_TOP, LSTMPolicy
 from helpers.learning.tracking_policy import TrackingPolicy
@@ -64,8 +63,8 @@ class ModeStep(nn.Module):
         for layer, *states in zip(self.policy.lstms, memory[::2], memory[1::2], strict=True):
             output, found = layer(signal[None], tuple(state[None] for state in states))
             after += [state[0] for state in found]
-            signal = functional.leaky_relu(output[0], self.policy.params.leaky_slope)
-        top = functional.relu6(self.policy.output(signal)[:, : len(self.low)]).double()
+            signal = nn.functional.leaky_relu(output[0], self.policy.params.leaky_slope)
+        top = nn.functional.relu6(self.policy.output(signal)[:, : len(self.low)]).double()
         return (self.low + self.span * top / RELU6_TOP, *after)
 
 
@@ -120,10 +119,8 @@ def _shown(name: str, card: Mapping[str, Any]) -> str:
         key: ", ".join(f"{variable} {low:g}" + (f" to {high:g}" if high > low else "") for variable, (low, high) in found.items())
         for key, found in (("set_points", card["set_point_range"]), ("inputs", card["input_range"]))
     }
-    words["scores"] = "; ".join(
-        f"Case {ROMAN[int(case) - 1]}, " + ", ".join(f"{who} {value:.2f}" for who, value in found.items())
-        for case, found in card["scores"].items()
-    )
+    scores = {case: ", ".join(f"{who} {value:.2f}" for who, value in found.items()) for case, found in card["scores"].items()}
+    words["scores"] = "; ".join(f"Case {ROMAN[int(case) - 1]}, {said}" for case, said in scores.items())
     return CARD.format(**dict(card) | words, name=name)
 
 

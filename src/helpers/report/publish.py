@@ -19,11 +19,8 @@ from helpers.runs.sources import PROJECT
 
 LATEST, REFERENCE, RESULTS = PROJECT / "reports/latest", PROJECT / "reports/reference", PROJECT / "results"
 LIMITS = "tables/limits_gaps.csv"
-# Of README's gaps to the optimum:
-SHOWN = (
-    *("expert", "online", "irl_reinforce", "scratch_reinforce", "ppo", "recurrent_ppo", "pid_tuned"),
-    *("one_policy", "mpc", "minimum_variance", "dynamic_programme_filtered"),
-)
+SHOWN = ["expert", "online", "irl_reinforce", "scratch_reinforce", "ppo", "recurrent_ppo", "pid_tuned"]  # of README's gaps
+SHOWN += ["one_policy", "mpc", "minimum_variance", "dynamic_programme_filtered"]
 LEARNT, VARIANTS = re.compile(r"0[24]_(?:offline_irl|knowledge_transfer)_(\w+)"), ("improved", "printed")
 LINK = re.compile(r"\]\((?:(\.\./)|(?=\d\d_\w+\.ipynb\)))")
 GLANCE = {  # of tables/gaps.csv, and its headers in README
@@ -51,12 +48,9 @@ def read_provenance(folder: Path) -> dict[str, Any]:
 
 
 def check(latest: dict[str, Any], reference: dict[str, Any] | None, revision: str) -> None:
-    """Refuse what must not be published.
+    """Refuse by PublishError a run at smoke scale, of uncommitted or other code, or with fewer seeds than published or asked for.
 
-    Raises:
-        PublishError: for a run at smoke scale, with uncommitted code, of other code than that checked out, or with fewer
-            seeds than the published one, or without some of the seeds asked for. A stage may be of an earlier commit: the report
-            has made sure that nothing behind it has changed since.
+    A stage may be of an earlier commit: the report has made sure that nothing behind it has changed since.
     """
     if latest["scale"] != "paper":
         raise PublishError(f"reports/latest was run at {latest['scale']} scale; only paper scale is published")
@@ -150,11 +144,7 @@ def executed_copy(text: str) -> str:
 
 
 def publish() -> None:
-    """Check the last run, put it in the place of the reference and its numbers into README and docs.
-
-    Raises:
-        PublishError, OSError: if the run may not be published, or cannot be.
-    """
+    """Put the last run in the place of the reference and its numbers into README and docs; PublishError where that must not be."""
     latest = read_provenance(LATEST)
     reference = read_provenance(REFERENCE) if (REFERENCE / "provenance.json").is_file() else None
     check(latest, reference, code_revision(PROJECT))

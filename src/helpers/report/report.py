@@ -17,19 +17,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from helpers.evidence.readings import MAIN
-from helpers.report import (
-    drawings,
-    figures,
-    limits_findings,
-    limits_report,
-    scorecard,
-    search_report,
-    statistics,
-    tables,
-    verdict_figures,
-)
+from helpers.learning.features import feature_names
+from helpers.report import drawings, figures, limits_findings, limits_report, scorecard, search_report, tables, verdict_figures
 from helpers.report.collection import ONLINE, Results, offline_folder
 from helpers.report.limits_figures import GRIDS, LABELS, RIVALS
+from helpers.report.statistics import FEWEST, LEVEL
 from helpers.report.typesetting import render, shortened, to_html, to_pdf
 from helpers.runs.artifacts import ArtifactError, code_revision
 from helpers.runs.identity import digest, versions
@@ -37,7 +29,7 @@ from helpers.runs.opening import parameters_hash
 from helpers.runs.pictures import smaller
 from helpers.runs.scratch import beside, sweep
 from helpers.runs.sources import PROJECT
-from helpers.settings.paper import OnlineParams, Params
+from helpers.settings.paper import Params
 
 RUNNERS = ("papermill", "snakemake", "pypandoc_binary", "typst")  # packages that shape no number
 SHOWN_AS_PIXELS = ("figure_3", "comparison")  # in README and report.md, where a reader without a browser of its own meets them
@@ -50,11 +42,7 @@ LEVELS = ("expert_paired", "offline", scorecard.MINIMUM_VARIANCE)  # what online
 
 
 def draw(results: Results, compared: pd.DataFrame) -> dict[str, Figure]:
-    """All figures of the report by name, each over all seeds.
-
-    Args:
-        compared: the comparison with the paper.
-    """
+    """All figures of the report by name, each over all seeds; `compared` is the comparison with the paper."""
     first = next(iter(results.params.values()))
     policy, process = first.learning.policy, first.process
     outputs, inputs = process.controlled, process.manipulated
@@ -66,10 +54,9 @@ def draw(results: Results, compared: pd.DataFrame) -> dict[str, Figure]:
         "figure_2": drawings.framework_figure(),
         "network": drawings.network_figure(policy.hidden_cells, len(outputs), len(inputs), policy.leaky_slope),
     }
-    levels = {
-        case: {tables.CONTROLLERS[stage]: results.median(case, stage, "objective_x") for stage in LEVELS} for case in results.params
-    }
+    levels = {}
     for case, params in results.params.items():
+        levels[case] = {tables.CONTROLLERS[stage]: results.median(case, stage, "objective_x") for stage in LEVELS}
         target, offline = params.case.set_point, offline_folder(params)
         response = results.table(case, ONLINE, "response.csv")
         drawn[f"control_case_{case}"] = figures.control_figure(response, outputs, inputs, target, descriptions)
@@ -86,12 +73,13 @@ def draw(results: Results, compared: pd.DataFrame) -> dict[str, Figure]:
         papers, unweighted = {"the paper's own gap": results.published[case].feature_gap}, history.filter(regex="^(?!alpha:)")
         drawn[f"learning_curves_case_{case}"] = figures.learning_curves(unweighted, marks=marks, gap_levels=papers)
         drawn[f"weights_{case}"] = verdict_figures.weights_figure(history, compared[compared["case"] == case])
-        history = results.table(case, ONLINE, "history.csv")
-        marks = _rounds(params.case.online, history["epochs"].nunique())
+        history, online = results.table(case, ONLINE, "history.csv"), params.case.online
+        n_epochs = history["epochs"].nunique()  # at smoke scale fewer than the parameters say; the rounds shrink alike
+        ends = [round(n_epochs * end / sum(online.epochs)) for end in itertools.accumulate(online.epochs[:-1])]
+        marks = {end: f"next round, β = {beta:g}" for end, beta in zip(ends, online.beta[1:], strict=True)}
         drawn[f"online_curves_case_{case}"] = figures.learning_curves(history, marks=marks, return_levels=levels[case])
     if len(results.budget):
-        titles = {case: tables.case_study(case) for case in results.params}
-        drawn["online_budget"] = figures.budget_figure(results.budget, levels, titles)
+        drawn["online_budget"] = figures.budget_figure(results.budget, levels)
     if len(results.claims):
         drawn["claims"] = verdict_figures.claims_figure(scorecard.claims_by_case(results.claims))
     if results.search is not None:
@@ -105,19 +93,10 @@ def draw(results: Results, compared: pd.DataFrame) -> dict[str, Figure]:
     return {f"figure_{OF_THE_PAPER[name]}" if name in OF_THE_PAPER else name: figure for name, figure in drawn.items()}
 
 
-def _rounds(online: OnlineParams, n_epochs: int) -> dict[int, str]:
-    """The last epoch before each later round of online learning, and that round's beta, to mark on a curve.
-
-    At smoke scale a run has fewer epochs than the parameters say; its rounds shrink alike.
-    """
-    ends = [round(n_epochs * end / sum(online.epochs)) for end in itertools.accumulate(online.epochs[:-1])]
-    return {end: f"next round, β = {beta:g}" for end, beta in zip(ends, online.beta[1:], strict=True)}
-
-
 def tabulate(results: Results) -> dict[str, pd.DataFrame]:
     """All tables of the report by name."""
-    names, medians, first = results.feature_names, results.medians, next(iter(results.params.values()))
-    process, scale = first.process, first.learning.scales[results.scale]
+    medians, first = results.medians, next(iter(results.params.values()))
+    process, scale, names = first.process, first.learning.scales[results.scale], feature_names(first.process.controlled)
     trajectories = {"expert": scale.expert_evaluation, "policy": scale.evaluation}
     compared = scorecard.comparison(results.published, results.seeds, medians, names, trajectories)
     tabulated = {
@@ -188,10 +167,8 @@ def _seconds(results: Results) -> pd.DataFrame:
 def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] | None = None) -> Path:
     """Write report.html, .pdf and .md, figures/, tables/, comparison.csv, seeds.csv and provenance.json; returns the first's path.
 
-    What an earlier report left in those places is replaced; other files of the folder stay.
-
-    Args:
-        tabulated: what `tabulate` gave for these results, if it was asked before.
+    What an earlier report left in those places is replaced; other files of the folder stay. `tabulated` is what `tabulate` gave for
+    these results, if it was asked before.
     """
     partial = beside(folder / "report")
     try:
@@ -221,12 +198,10 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
             shutil.copy2(BENCHMARKS / "scaling.svg", partial / "figures/benchmarks.svg")
         values = said(results, tabulated, origin)
         with ThreadPoolExecutor() as pool:  # both wait for other programs
-            begun = [
-                pool.submit(typeset, render("report.md.jinja", folder, appendix=appendix, **values), partial)
-                for typeset, appendix in ((to_html, None), (to_pdf, []))
-            ]
-        for page in begun:
-            page.result()
+            html = pool.submit(to_html, render("report.md.jinja", folder, appendix=None, **values), partial)
+            pdf = pool.submit(to_pdf, render("report.md.jinja", folder, appendix=[], **values), partial)
+        html.result()
+        pdf.result()
         (partial / "report.md").write_text(render("summary.md.jinja", folder, appendix=None, **values), encoding="utf-8")
         for path in sorted(partial.iterdir(), key=lambda path: path.name == PROVENANCE):  # last: it vouches for the others
             target = folder / path.name
@@ -243,7 +218,7 @@ def write(folder: Path, results: Results, tabulated: Mapping[str, pd.DataFrame] 
 def said(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mapping[str, Any]) -> dict[str, Any]:
     """What the templates say, by name; every number in their prose comes from the results."""
     numbers = results.numbers[["median", "ci_low", "ci_high"]]
-    compared, limits = tabulated["comparison"], limits_findings.find(results)
+    compared = tabulated["comparison"]
 
     def number(case: int, stage: str, metric: str, factor: float = 1, **style: Any) -> str:
         """A median with its interval."""
@@ -267,19 +242,16 @@ def said(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mappin
         "plain": plain,
         "gaps": tabulated["gaps"].set_index("case").to_dict("index"),
         "cases": results.params,
-        "published": results.published,
         "of_the_paper": {case: OF_THE_PAPER[f"control_case_{case}"] for case in results.params},
         "benchmarks": benchmarks,
         "claims": tabulated.get("claims_by_case"),
         "changed_claims": results.claims.loc[results.claims["changed"].fillna("") != "", "id"].nunique(),
         "search": tabulated["search"].set_index("case").to_dict("index") if "search" in tabulated else {},
         "frozen": _frozen(results),
-        "limits": limits,
+        "limits": limits_findings.find(results),
         "rivals": {name: LABELS[name] for name in RIVALS},
         "grids": {group: title for group, (title, _, _) in GRIDS.items()},
         "heat_maps": [name.removeprefix("limits_") for name in limits_report.heat_map_names(results)],
-        "one_policy": tabulated.get("one_policy", ()),
-        "own_plant": tabulated.get("own_plant", ()),
         "verdicts": compared["verdict"].value_counts().reindex(scorecard.VERDICTS, fill_value=0).to_dict(),
         "weights": {"total": len(weights), "open": int((weights["verdict"] == "cannot tell").sum()), "alike": int(alike.sum())},
         "offset": {stage: abs(results.median(3, stage, "offset:C_A")) for stage in tables.CONTROLLERS},
@@ -288,8 +260,8 @@ def said(results: Results, tabulated: Mapping[str, pd.DataFrame], origin: Mappin
         "nearer": scorecard.nearer_to_expert(compared),
         "outside": scorecard.outside(compared),
         "settings": partial(_settings, tabulated["parameters"]),
-        "level": statistics.LEVEL,
-        "fewest": statistics.FEWEST,
+        "level": LEVEL,
+        "fewest": FEWEST,
         "trajectories": scorecard.PUBLISHED_TRAJECTORIES,
         "widest": scorecard.WIDEST,
     }
@@ -330,7 +302,5 @@ def _better(results: Results) -> dict[str, list[int]]:
         "worse": [case for case in papers if low[case, "offline", "feature_gap"] > papers[case]],
         "printed": [case for case in papers if high[case, "offline_printed", "feature_gap"] < papers[case]],
         "worse_as_printed": [case for case in papers if low[case, "offline_printed", "feature_gap"] > papers[case]],
-        "online": [
-            case for case in results.params if low[case, "online", "objective_x"] > high[case, "expert_paired", "objective_x"]
-        ],
+        "online": [case for case in papers if low[case, "online", "objective_x"] > high[case, "expert_paired", "objective_x"]],
     }

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from helpers.report.statistics import median_interval, prediction_interval
-from helpers.report.tables import NOT_KNOWN, RESULT_DECIMALS, ROMAN
+from helpers.report.tables import NOT_KNOWN, RESULT_DECIMALS, ROMAN, capital
 from helpers.settings.paper import HEADLINE, PublishedCase
 
 REPRODUCED_BY = {"expert": ("expert", "v"), "policy": ("offline", "v"), "alpha": ("offline", "alpha")}  # stage, metric
@@ -25,10 +25,7 @@ def summary(seeds: pd.DataFrame) -> pd.DataFrame:
     """Every number over its seeds: case, stage, metric, n_seeds, median, ci_low, ci_high, least, p90, greatest.
 
     ci_low and ci_high are the ends of the 95 % bootstrap interval of the median, nan for too few seeds; p90 is the 90th percentile.
-    A seed without the number (nan) is left out.
-
-    Args:
-        seeds: columns case, seed, stage, metric, value.
+    `seeds` has the columns case, seed, stage, metric, value; a seed without the number (nan) is left out.
     """
     runs = seeds.pivot_table(index=KEYS, columns="seed", values="value")
     columns = ["n_seeds", "median", "ci_low", "ci_high", "least", "p90", "greatest"]
@@ -68,10 +65,7 @@ def gaps(medians: pd.DataFrame, published: Mapping[int, PublishedCase]) -> pd.Da
     Columns: case; n_seeds; feature_gap, its median, with the ends of its interval, the 90th percentile and the greatest;
     published_gap, the mean of |v_pi - v_E| / |v_E| over the paper's own rows; printed_gap (of the algorithms as printed),
     expert_error and online_share, medians with the ends of their intervals. All but the first two are shares of one; what no seed
-    gave is nan.
-
-    Args:
-        medians: of `summary`, with the rows of `relative`.
+    gave is nan. `medians` are those of `summary`, with the rows of `relative`.
     """
     found, wide = medians.set_index(KEYS), ("median", "ci_low", "ci_high", "p90", "greatest")
     wanted = {  # name: stage, metric, what is shown
@@ -96,11 +90,9 @@ def verdict(row: str, published: float, n_seeds: int, low: float, high: float) -
     """The verdict on one published number and, in a clause, its reason. The rule:
 
     `fitted` for the row whose settings were inferred from these numbers; `cannot tell` with fewer than two seeds; otherwise
-    `differs` where the published value lies outside the prediction interval, however wide that is, and inside it, its ends
-    included, `match`, or `cannot tell` where it reaches further than a quarter of the value to either side of its middle.
-
-    Args:
-        low, high: 95 % prediction interval for one run.
+    `differs` where the published value lies outside the 95 % prediction interval for one run, `low` to `high`, however wide, and
+    inside it, its ends included, `match`, or `cannot tell` where it reaches further than a quarter of the value to either side of
+    its middle.
     """
     if n_seeds < 2:
         one = ("fitted", "settings inferred from it") if row == FITTED else ("cannot tell", "one seed")
@@ -134,10 +126,8 @@ def comparison(
     sampling variance they lack, s^2 (1/500 - 1/K), is added. Weights carry no such error beyond their run's own.
     A number that no seed gave is nan with n_seeds 0.
 
-    Args:
-        seeds: columns case, seed, stage, metric, value; `medians`: their `summary`.
-        trajectories: K of each row that holds features.
-        sampling_errors: s/sqrt(500) by case and feature, where another than that of our own trajectories is to be taken.
+    `medians` are the `summary` of the seeds (columns case, seed, stage, metric, value), `trajectories` are K of each row that holds
+    features, and `sampling_errors` s/sqrt(500) by case and feature, where another than our own is to be taken.
     """
     found = medians.set_index(KEYS)
     runs = {key: group.dropna().to_numpy() for key, group in seeds.groupby(KEYS)["value"]}
@@ -149,10 +139,8 @@ def comparison(
                 ours = found.reindex([key]).iloc[0]
                 n_seeds, lacking = int(np.nan_to_num(ours["n_seeds"])), 0.0
                 if n_seeds and metric == "v":
-                    if error := (sampling_errors or {}).get((case, feature)):
-                        variance = PUBLISHED_TRAJECTORIES * error**2
-                    else:
-                        variance = float(np.mean(runs[case, stage, f"v:{feature}:std"] ** 2))
+                    error = (sampling_errors or {}).get((case, feature))
+                    variance = PUBLISHED_TRAJECTORIES * error**2 if error else np.mean(runs[case, stage, f"v:{feature}:std"] ** 2)
                     lacking = variance * max(0.0, 1 / PUBLISHED_TRAJECTORIES - 1 / trajectories[row])
                 low, high = prediction_interval(runs.get(key, ()), lacking)
                 numbers = [ours["median"], n_seeds, ours["ci_low"], ours["ci_high"], low, high]
@@ -164,9 +152,7 @@ def sampling_errors(prediction: pd.DataFrame, published: Mapping[int, PublishedC
     """The standard error of a published Type III feature, by case and feature, as the fit of the settings has it.
 
     There |e| before the first step is each trajectory's own, here its mean, one: the same expectation, but a wider scatter.
-
-    Args:
-        prediction: columns table, feature, published, simulated, deviation (in these standard errors) of the expert's features.
+    `prediction` has the columns table, feature, published, simulated, deviation (in these errors) of the expert's features.
     """
     case_of = {record.table: case for case, record in published.items()}
     rows = prediction[prediction["feature"].str.endswith("-III") & prediction["table"].isin(case_of)]
@@ -205,26 +191,21 @@ def held_out(prediction: pd.DataFrame) -> pd.DataFrame:
     """How far the settings fitted to some tables reproduce each table: a row for each pair of them.
 
     Columns: fitted_on, table, role (fit or prediction), mean_error and greatest_error (of the features, in per cent),
-    greatest_deviation (in sampling errors of a published feature).
-
-    Args:
-        prediction: columns fitted_on, table, deviation and relative_error of each feature, on trajectories that no fit has seen.
+    greatest_deviation (in sampling errors of a published feature). `prediction` has the columns fitted_on, table, deviation and
+    relative_error of each feature, on trajectories that no fit has seen.
     """
     errors = prediction.assign(error=100 * prediction["relative_error"].abs(), deviation=prediction["deviation"].abs())
-    rows = []
-    for (fitted_on, table), features in errors.groupby(["fitted_on", "table"], sort=False):
-        fitted = fitted_on == "parameter files" or str(table) in fitted_on.split()
-        row = {"fitted_on": fitted_on, "table": table, "role": "fit" if fitted else "prediction"}
-        row |= {"mean_error, %": features["error"].mean(), "greatest_error, %": features["error"].max()}
-        rows.append(row | {"greatest_deviation": features["deviation"].max()})
-    return pd.DataFrame(rows)
+    shown = {"mean_error, %": ("error", "mean"), "greatest_error, %": ("error", "max"), "greatest_deviation": ("deviation", "max")}
+    found = errors.groupby(["fitted_on", "table"], sort=False).agg(**shown)
+    fitted = [fitted_on == "parameter files" or str(table) in fitted_on.split() for fitted_on, table in found.index]
+    found.insert(0, "role", np.where(fitted, "fit", "prediction"))
+    return found.reset_index()
 
 
 def against_headline(trials: pd.DataFrame) -> dict[str, str]:
     """By trial, the cases in which it is better or worse than the variant `improved`, paired by seed, by the whole interval.
 
-    Args:
-        trials: columns trial, case, seed, gap (a share of one); the variants are among the trials.
+    `trials` has the columns trial, case, seed, gap (a share of one); the variants are among them.
     """
     gaps = trials.pivot_table(index=["case", "seed"], columns="trial", values="gap")
     found = {}
@@ -242,21 +223,16 @@ def claims_by_case(claims: pd.DataFrame) -> pd.DataFrame:
     """One row a claim: section, statement, a verdict for each case it is made of, the verdict on the whole, and how it was counted.
 
     One rule for all sides: `holds` or `does not hold` where every quantity says so, `in part` where both occur, otherwise
-    `cannot tell` or `not comparable`.
-
-    Args:
-        claims: columns id, section, statement, case, quantity, verdict.
+    `cannot tell` or `not comparable`. `claims` has the columns id, section, statement, case, quantity, verdict.
     """
     rows = []
     for _, found in claims.groupby("id", sort=False):
-        row = {name: found[name].iloc[0] for name in ("section", "statement")}
-        row["statement"] = row["statement"][:1].upper() + row["statement"][1:]
+        row = {"section": found["section"].iloc[0], "statement": capital(found["statement"].iloc[0])}
         of_case = found.groupby("case")["verdict"].agg(_together)
         row |= {ROMAN[case - 1]: of_case.get(case, "") for case in sorted(claims["case"].unique())}
         counted = found["verdict"].value_counts(sort=False)
-        row["overall"] = _together(found["verdict"])
-        row["quantities"] = ", ".join(f"{count} {verdict}" for verdict, count in counted.items()) if len(found) > 1 else ""
-        rows.append(row)
+        said = ", ".join(f"{count} {verdict}" for verdict, count in counted.items()) if len(found) > 1 else ""
+        rows.append(row | {"overall": _together(found["verdict"]), "quantities": said})
     return pd.DataFrame(rows)
 
 

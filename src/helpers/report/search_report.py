@@ -27,11 +27,7 @@ def best_of(trials: pd.DataFrame) -> pd.DataFrame:
 
 
 def gap_figure(trials: pd.DataFrame, published: Mapping[int, PublishedCase]) -> Figure:
-    """The gap of every trial against the rank of its setting on the first seed; a panel for each case.
-
-    Args:
-        trials: as of `Search.run`.
-    """
+    """The gap of every trial (as of `Search.run`) against the rank of its setting on the first seed; a panel for each case."""
     figure, best = empty_figure(WIDTH, 3.8), best_of(trials)
     cases = sorted(trials["case"].unique())
     for case, axes in zip(cases, figure.subplots(1, len(cases), sharey=True, squeeze=False)[0], strict=True):
@@ -43,9 +39,8 @@ def gap_figure(trials: pd.DataFrame, published: Mapping[int, PublishedCase]) -> 
         axes.axhline(100 * published[case].feature_gap, color=LEVEL, label="the paper's own gap")
         axes.axhline(100 * best.loc[case, "by_hand"], color=MUTED, linestyle="--", label="settings by hand, median over seeds")
         axes.axhline(100 * best.loc[case, "median"], color=LOOP_COLOURS[3], linestyle=":", label="best settings, median over seeds")
-        axes.set_yscale("log")
+        head(axes, "", case_study(case), f"case {case}", yscale="log")
         axes.yaxis.set_major_formatter("{x:g}")
-        head(axes, "", case_study(case), f"case {case}")
     figure.supxlabel("rank of the setting on the first seed", fontsize=10)
     figure.supylabel("feature gap (%)", fontsize=10)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)
@@ -55,8 +50,7 @@ def gap_figure(trials: pd.DataFrame, published: Mapping[int, PublishedCase]) -> 
 def weights_figure(weights: pd.DataFrame, learnt: Mapping[str, pd.DataFrame], published: Mapping[int, PublishedCase]) -> Figure:
     """Weights of three kinds beside the printed ones, a panel for each case: alpha* over seeds, and those of the sample that match.
 
-    Args:
-        weights: as of `sampled`. learnt: alpha* by what learnt it, columns case and alpha:<feature>.
+    `weights` are those of `sampled`; `learnt` holds alpha* by what learnt it, columns case and alpha:<feature>.
     """
     cases, columns = sorted(weights["case"].unique()), [name for name in weights if name.startswith("alpha:")]
     figure = empty_figure(WIDTH, 2.3 * len(cases) + 0.6)
@@ -75,24 +69,17 @@ def weights_figure(weights: pd.DataFrame, learnt: Mapping[str, pd.DataFrame], pu
         axes.set_xticks(range(len(columns)), [feature_symbol(name.removeprefix("alpha:")) for name in columns])
         least, relearnt = 100 * tried["gap"].min(), 100 * printed["gap"].median()
         words = f"gaps of the best policies within {100 * own:.1f} %: {within} of {len(tried)} sampled"
-        head(axes, "", f"{case_study(case)}, {words}; the nearest {least:.1f} %; the printed {relearnt:.1f} %", f"case {case}")
-        axes.set_ylabel(r"weight $\alpha$")
+        title = f"{case_study(case)}, {words}; the nearest {least:.1f} %; the printed {relearnt:.1f} %"
+        head(axes, "", title, f"case {case}", ylabel=r"weight $\alpha$")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
     return figure
 
 
 def draw(found: Stage, published: Mapping[int, PublishedCase], headline: pd.DataFrame) -> dict[str, Figure]:
-    """Both figures of a search by name.
-
-    Args:
-        headline: alpha* of the headline variant over seeds, columns case and alpha:<feature>.
-    """
+    """Both figures of a search by name; `headline`: alpha* of that variant over seeds, columns case and alpha:<feature>."""
     trials, weights = found.table("trials.csv"), found.table("weights.csv")
-    best = best_of(trials)["setting"]
-    learnt = {
-        r"$\alpha^*$ as printed, best settings": trials[trials["setting"] == trials["case"].map(best)],
-        rf"$\alpha^*$, {HEADLINE}": headline,
-    }
+    printed = trials[trials["setting"] == trials["case"].map(best_of(trials)["setting"])]
+    learnt = {r"$\alpha^*$ as printed, best settings": printed, rf"$\alpha^*$, {HEADLINE}": headline}
     return {"search_gaps": gap_figure(trials, published), "search_weights": weights_figure(weights, learnt, published)}
 
 

@@ -21,16 +21,14 @@ CONTROLLERS = {
 }
 LEARNING = {"offline": "improved", "offline_printed": "printed", "offline_scratch": "improved, from scratch"}
 COSTS = ("epochs", "chosen_epoch", "episodes", "gradient_steps")
-TYPESET = {
-    "E[v^E]": r"$\mathbb{E}[v^E]$",
-    "E[v^pi]": r"$\mathbb{E}[v^\pi]$",
-    "alpha*": r"$\alpha^*$",
-}
+TYPESET = {"E[v^E]": r"$\mathbb{E}[v^E]$", "E[v^pi]": r"$\mathbb{E}[v^\pi]$", "alpha*": r"$\alpha^*$"}
 NOT_KNOWN = "–"
 FEATURE = re.compile(r"(\w+)-(I{1,3})")
 NUMBER = re.compile(rf"-?[\d.]+(e-?\d+)?( %)?( \[.*\]| \(.*\))?|{NOT_KNOWN}|inf")
 VARIABLE = re.compile(r"(?<![A-Za-z_])(C_A0|C_A|T_E)(?![A-Za-z0-9_])")
 LOOP = re.compile(r"(.*)\((\w+)\) control loop")
+BOUNDS = {"input_bound": "bounds ±", "input_low": "lower bound", "input_high": "upper bound"}  # settings of notebook 00 in words
+NOISE = 1e-6  # a fitted gain below it is none
 
 
 def case_study(case: int) -> str:
@@ -38,8 +36,9 @@ def case_study(case: int) -> str:
     return f"Case Study {ROMAN[case - 1]}"
 
 
-BOUNDS = {"input_bound": "bounds ±", "input_low": "lower bound", "input_high": "upper bound"}  # settings of notebook 00 in words
-NOISE = 1e-6  # a fitted gain below it is none
+def capital(words: str) -> str:
+    """Words as a sentence begins; what follows stays as it is."""
+    return words[:1].upper() + words[1:]
 
 
 def symbol(name: str) -> str:
@@ -64,11 +63,7 @@ def setting_words(setting: str, component: str) -> str:
 
 
 def inferred_settings(settings: pd.DataFrame) -> pd.DataFrame:
-    """The settings that notebook 00 fitted, in words.
-
-    Args:
-        settings: its settings.csv, columns setting, component, value, low, high, identified, in_parameter_files.
-    """
+    """The settings that notebook 00 fitted (columns setting, component, value, low, high, in_parameter_files), in words."""
     names = [setting_words(*place) for place in settings[["setting", "component"]].itertuples(index=False)]
     numbers = settings[["value", "low", "high", "in_parameter_files"]]
     found = settings.assign(setting=names, **numbers.where(numbers.abs() > NOISE, 0.0))
@@ -80,25 +75,20 @@ def table_1(cases: Mapping[int, CaseParams], process: ProcessParams) -> pd.DataF
 
     The second argument of N is printed as in the paper; the parameter files say how it is read.
     """
-    loops = [
-        f"{description[:1].upper()}{description[1:]} ({name}) control loop"
-        for name, description in zip(process.controlled, process.controlled_description, strict=True)
-    ]
+    loops = zip(process.controlled, process.controlled_description, strict=True)
     rows = []
     for case, params in cases.items():
-        numeral = ROMAN[case - 1] if 0 < case <= len(ROMAN) else str(case)
-        spread = [f"N({mean:g}, {std:g})" for mean, std in zip(params.initial_mean, params.initial_std, strict=True)]
-        rows.append([numeral, "initial state distribution", *spread])
-        rows.append([numeral, "set point", *(f"{target:g}" for target in params.set_point)])
-    return pd.DataFrame(rows, columns=["case_study", "system_parameter", *loops])
+        start = zip(params.initial_mean, params.initial_std, strict=True)
+        rows.append([ROMAN[case - 1], "initial state distribution", *(f"N({mean:g}, {std:g})" for mean, std in start)])
+        rows.append([ROMAN[case - 1], "set point", *(f"{target:g}" for target in params.set_point)])
+    headers = [f"{capital(description)} ({name}) control loop" for name, description in loops]
+    return pd.DataFrame(rows, columns=["case_study", "system_parameter", *headers])
 
 
 def spread(numbers: Mapping[str, Any] | pd.Series, decimals: int | None = None, unit: str = "") -> str:
     """A median with its interval as text: 16.8 [16.5, 17.0]; the median alone where there is no interval or no spread at all.
 
-    Args:
-        numbers: median, ci_low and ci_high.
-        decimals: digits after the point, instead of three significant digits of the greatest of them.
+    `numbers` holds median, ci_low and ci_high, shown with so many decimals or, without, three significant digits of the greatest.
     """
     values = [float(numbers[name]) for name in ("median", "ci_low", "ci_high")]
     if np.isnan(values[0]):
@@ -112,11 +102,7 @@ def spread(numbers: Mapping[str, Any] | pd.Series, decimals: int | None = None, 
 
 
 def results_table(compared: pd.DataFrame, feature_names: Sequence[str]) -> pd.DataFrame:
-    """Table 2, 3 or 4 as text: each printed row and, below it, our median, the interval of one run, if any, and the verdict.
-
-    Args:
-        compared: the rows of one case in the comparison with the paper.
-    """
+    """Table 2, 3 or 4 as text, from one case of the comparison: printed row, our median, the interval of a run, the verdict."""
     rows = []
     for row, decimals in RESULT_DECIMALS.items():
         numbers = compared[compared["row"] == row].set_index("feature").loc[list(feature_names)]
@@ -134,11 +120,7 @@ def results_table(compared: pd.DataFrame, feature_names: Sequence[str]) -> pd.Da
 
 
 def quality_table(medians: pd.DataFrame, process: ProcessParams) -> pd.DataFrame:
-    """Control quality of one case as text, a row for each figure of merit and a column for each controller.
-
-    Args:
-        medians: columns stage, metric, median, ci_low, ci_high, of one case.
-    """
+    """Control quality of one case (columns stage, metric, median, ci_low, ci_high) as text: figures of merit by controller."""
     labels: dict[str, tuple[str, int, int | None]] = {  # of each metric its label, factor and digits after the point
         "objective_x": ("$J$ on $x$", 1, 2),
         "share": ("$J$ on $x$, % of minimum variance", 100, 1),
@@ -161,11 +143,7 @@ def quality_table(medians: pd.DataFrame, process: ProcessParams) -> pd.DataFrame
 
 
 def variants_table(medians: pd.DataFrame) -> pd.DataFrame:
-    """Feature gap, in per cent, and cost of each way of offline learning: median, 95 % interval and the worst seed of the gap.
-
-    Args:
-        medians: columns case, stage, metric, n_seeds, median, ci_low, ci_high, greatest.
-    """
+    """Gap in per cent (median, 95 % interval, worst seed) and cost of each way of offline learning, from a `scorecard.summary`."""
     rows = []
     for (case, stage), group in medians[medians["stage"].isin(LEARNING)].groupby(["case", "stage"]):
         found = group.set_index("metric")
@@ -179,10 +157,8 @@ def variants_table(medians: pd.DataFrame) -> pd.DataFrame:
 def trials_table(trials: pd.DataFrame) -> pd.DataFrame:
     """What was tried offline, a row for each trial: what it changes and for each case the feature gap in per cent.
 
-    A cell holds the median over the seeds with the least and the greatest, and how many they are.
-
-    Args:
-        trials: columns trial, family, description, case, seed, gap (a share of one).
+    A cell holds the median over the seeds with the least and the greatest, and how many they are. `trials` has the columns trial,
+    family, description, case, seed, gap (a share of one).
     """
     over_seeds = trials.groupby(["trial", "case"])["gap"].agg(["median", "min", "max", "count"])
     rows = []
@@ -197,22 +173,14 @@ def trials_table(trials: pd.DataFrame) -> pd.DataFrame:
 
 
 def time_table(seconds: pd.DataFrame) -> pd.DataFrame:
-    """Seconds of each stage (rows) in each case (columns).
-
-    Args:
-        seconds: columns case, stage, seconds.
-    """
+    """Seconds of each stage (rows) in each case (columns), from columns case, stage, seconds."""
     wide = seconds.pivot_table(index="stage", columns="case", values="seconds").map(_cell, decimals=0)
     wide = wide.rename(index=lambda stage: stage.replace("_", " "), columns=lambda case: f"Case {ROMAN[case - 1]}")
     return wide.reset_index()
 
 
 def parameters_table(leaves: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
-    """Every parameter once, as text: file, key, value, unit, source, status.
-
-    Args:
-        leaves: rows as `params.load` lists them; those of several cases may repeat the shared files.
-    """
+    """Every parameter once, as text: file, key, value, unit, source, status; the leaves of several cases repeat shared files."""
     rows = [{**leaf, "value": render(leaf["value"])} for leaf in leaves]
     return pd.DataFrame(rows, columns=["file", "key", "value", "unit", "source", "status"]).drop_duplicates(ignore_index=True)
 
@@ -229,43 +197,31 @@ def render(value: Any) -> str:
 def to_markdown(frame: pd.DataFrame, digits: int = 4, labels: Mapping[str, str] | None = None) -> str:
     """A pipe table for pandoc, without the index; columns of numbers, with or without an interval, to the right.
 
-    Feature names and the quantities of Tables 2-4 are typeset, Markdown's own characters are escaped.
-
-    Args:
-        digits: significant digits of a number that is not an integer.
-        labels: headers by column, instead of the column's name with spaces for underscores.
+    Feature names and the quantities of Tables 2-4 are typeset, Markdown's own characters are escaped. A number that is not an
+    integer has so many significant digits; `labels` are headers by column, instead of its name with spaces for underscores.
     """
-    given = labels or {}
     cells = pd.DataFrame({column: [_cell(value, digits) for value in frame[column]] for column in frame.columns})
-    numeric = [cells[column].map(lambda cell: NUMBER.fullmatch(cell) is not None).all() for column in cells]
-    headers = [_text(given[column]) if column in given else _header(str(column)) for column in frame.columns]
-    return cells.to_markdown(
-        index=False,
-        headers=headers,
-        disable_numparse=True,
-        colalign=["right" if right else "left" for right in numeric] if len(cells) else None,
-    )
+    align = ["right" if all(map(NUMBER.fullmatch, cells[column])) else "left" for column in cells] if len(cells) else None
+    headers = [_text(labels[column]) if labels and column in labels else _header(str(column)) for column in frame.columns]
+    return cells.to_markdown(index=False, headers=headers, disable_numparse=True, colalign=align)
 
 
 def _header(name: str) -> str:
     typeset = _text(name)
-    if typeset != name or FEATURE.fullmatch(name) or "$" in name:
+    if typeset != name or "$" in name:
         return typeset
     parts = VARIABLE.sub(lambda found: symbol(found[0]), name).split(" ")
-    words = " ".join(part if "$" in part else part.replace("_", " ") for part in parts)
-    return words[:1].upper() + words[1:]
+    return capital(" ".join(part if "$" in part else part.replace("_", " ") for part in parts))
 
 
 def _cell(value: Any, digits: int = 4, decimals: int | None = None) -> str:
+    if isinstance(value, str):
+        return _text(value)
     if pd.isna(value):
         return NOT_KNOWN
-    if isinstance(value, (bool, np.bool_)):
-        return render(bool(value))
-    if isinstance(value, (int, np.integer)):
-        return str(value)
     if isinstance(value, (float, np.floating)):
         return _number(float(value), digits, decimals)
-    return _text(str(value))
+    return render(bool(value) if isinstance(value, np.bool_) else value)
 
 
 def _number(value: float, digits: int = 4, decimals: int | None = None) -> str:

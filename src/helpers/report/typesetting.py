@@ -14,7 +14,7 @@ import typst
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image
 
-from helpers.report import tables
+from helpers.report.tables import ROMAN, to_markdown
 from helpers.runs.sources import PROJECT
 
 PALETTE = 64  # colours of a picture inside a drawing, each with its own opacity
@@ -35,17 +35,13 @@ def environment() -> Environment:
         comment_end_string="##}",
     )
     found.filters["percent"] = lambda share: f"{100 * share:.1f} %"
-    found.filters["numeral"] = lambda case: tables.ROMAN[case - 1]
-    found.filters["table"] = tables.to_markdown
+    found.filters["numeral"] = lambda case: ROMAN[case - 1]
+    found.filters["table"] = to_markdown
     return found
 
 
 def render(template: str, folder: Path, **values: Any) -> str:
-    """A template as Markdown, its figures, tables and equations numbered.
-
-    Args:
-        folder: where the report is to stand, for links to the project's files.
-    """
+    """A template as Markdown, its figures, tables and equations numbered; links to the project's files lead from `folder`."""
 
     def link(words: str, place: str) -> str:
         return f"[{words}]({Path(os.path.relpath(PROJECT / place, folder)).as_posix()})"
@@ -56,10 +52,8 @@ def render(template: str, folder: Path, **values: Any) -> str:
 def numbered(text: str) -> str:
     """The Markdown with a number for every `#fig:name#` (tab, eq), in their order, and a link for every `@fig:name`.
 
-    What stands in a fold, `#A:fig:name#`, is counted apart. A number leads back to the first link to it.
-
-    Raises:
-        KeyError: for a link to what does not exist.
+    What stands in a fold, `#A:fig:name#`, is counted apart. A number leads back to the first link to it; a link to what does not
+    exist raises KeyError.
     """
     counts: Counter[str] = Counter()
     numbers: dict[str, str] = {}

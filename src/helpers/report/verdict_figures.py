@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 
 from helpers.report.figures import INK, MUTED, WIDTH, empty_figure, feature_styles, head
 from helpers.report.tables import ROMAN, feature_symbol, setting_words, symbol
@@ -40,10 +39,7 @@ def comparison_figure(compared: pd.DataFrame) -> Figure:
     """Every published number of Tables 2 to 4 and ours: a panel for each table, a row for each number, marked by its verdict.
 
     The axis is how far ours lies from the published number, in per cent of it; the line is the 95 % interval for one run, and
-    the published number is nought.
-
-    Args:
-        compared: the comparison with the paper, columns of `scorecard.COLUMNS`.
+    the published number is nought. The comparison with the paper has the columns `scorecard.COLUMNS`.
     """
     printed = sorted(compared["table"].unique())
     numbers = compared[["reproduced", "pred_low", "pred_high"]].sub(compared["published"], axis=0)
@@ -62,7 +58,7 @@ def comparison_figure(compared: pd.DataFrame) -> Figure:
         axes.axvline(0, color=INK, linewidth=1)
         axes.set_xscale("symlog", linthresh=LINEAR, linscale=1.2)
         axes.xaxis.set_minor_locator(NullLocator())
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda share, _: f"{share:+,.0f}" if share else "0"))
+        axes.xaxis.set_major_formatter(lambda share, _: f"{share:+,.0f}" if share else "0")
         axes.set_title(f"Table {table} (Case {ROMAN[rows['case'].iloc[0] - 1]})", fontsize=9)
         axes.set_label(f"Table {table}")
         axes.grid(axis="y", visible=False)
@@ -79,11 +75,7 @@ def comparison_figure(compared: pd.DataFrame) -> Figure:
 
 
 def claims_figure(judged: pd.DataFrame) -> Figure:
-    """The paper's claims, a row for each, with a mark for each case study.
-
-    Args:
-        judged: `scorecard.claims_by_case`: statement, then a column for each case with a verdict or an empty text.
-    """
+    """The paper's claims as `scorecard.claims_by_case` gives them, a row for each, with a mark for each case study."""
     cases = [column for column in judged if column in ROMAN]
     lines = [fill(statement, 96) for statement in judged["statement"]]
     sizes = np.array([line.count("\n") + 1.4 for line in lines])
@@ -97,8 +89,7 @@ def claims_figure(judged: pd.DataFrame) -> Figure:
     axes.set_yticks(heights, lines, fontsize=8)
     axes.set_xticks(range(len(cases)), cases)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
-    axes.set(xlim=(-0.6, len(cases) - 0.4), ylim=(-ends[-1], 0))
-    axes.set_label("claims")
+    axes.set(xlim=(-0.6, len(cases) - 0.4), ylim=(-ends[-1], 0), label="claims")
     axes.spines[["left", "bottom"]].set_visible(False)
     listed = _handles(("holds", "in part", "does not hold", "cannot tell", "not comparable"), judged[cases].to_numpy().ravel())
     figure.legend(handles=listed, loc="outside upper center", ncols=5, frameon=False)
@@ -109,10 +100,7 @@ def weights_figure(history: pd.DataFrame, compared: pd.DataFrame) -> Figure:
     """The weights while they are learned, a panel for each loop, and those learned beside the printed ones.
 
     A curve is the median over seeds, averaged over a twentieth of the epochs; its band holds the middle half of the seeds.
-
-    Args:
-        history: columns epochs, seed and alpha:<feature>.
-        compared: the rows of one case in the comparison with the paper.
+    `history` has the columns epochs, seed and alpha:<feature>; `compared` is one case of the comparison with the paper.
     """
     printed = compared[compared["row"] == "alpha"].set_index("feature")
     loops = list(dict.fromkeys(name.rpartition("-")[0] for name in printed.index))
@@ -120,6 +108,7 @@ def weights_figure(history: pd.DataFrame, compared: pd.DataFrame) -> Figure:
     *panels, last = figure.subplots(1, len(loops) + 1)
     styles = feature_styles(list(printed.index))
     width = max(1, round(SMOOTH * history["epochs"].nunique()))
+    below: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.17), "frameon": False, "columnspacing": 1}
     for letter, axes, loop in zip(ascii_uppercase, panels, loops, strict=False):
         for name in printed.index[printed.index.str.rpartition("-").get_level_values(0) == loop]:
             runs = history.pivot_table(index="epochs", columns="seed", values=f"alpha:{name}").rolling(width, min_periods=1).mean()
@@ -127,40 +116,31 @@ def weights_figure(history: pd.DataFrame, compared: pd.DataFrame) -> Figure:
             axes.plot(runs.index, runs.median(axis=1), label=label, **style)
             low, high = runs.quantile(0.25, axis=1), runs.quantile(0.75, axis=1)
             axes.fill_between(runs.index, low, high, color=style["color"], alpha=0.15, linewidth=0)
-            axes.plot(
-                [runs.index[-1]], [printed.loc[name, "published"]], marker="*", markersize=9, color=style["color"], clip_on=False
-            )
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=3, frameon=False, handlelength=2, columnspacing=1)
-        head(axes, letter, f"Loop of {symbol(loop)}", f"{letter} {loop}")
-        axes.set(xlabel="epoch", ylabel="weight (no unit)" if loop == loops[0] else "", ylim=(-1, 1))
+            star: Any = {"marker": "*", "markersize": 9, "color": style["color"], "clip_on": False}
+            axes.plot([runs.index[-1]], [printed.loc[name, "published"]], **star)
+        axes.legend(ncols=3, handlelength=2, **below)
+        ylabel = "weight (no unit)" if loop == loops[0] else ""
+        head(axes, letter, f"Loop of {symbol(loop)}", f"{letter} {loop}", xlabel="epoch", ylabel=ylabel, ylim=(-1, 1))
         axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
-    _beside_the_printed(last, ascii_uppercase[len(loops)], printed)
-    return figure
-
-
-def _beside_the_printed(axes: Axes, letter: str, printed: pd.DataFrame) -> None:
-    """Each weight with its interval for one run, by its verdict, and the printed one as a star."""
-    head(axes, letter, "Learned and printed", "printed")
+    # Beside them each weight with its interval for one run, by its verdict, and the printed one as a star.
+    head(last, ascii_uppercase[len(loops)], "Learned and printed", "printed", xlabel="weight (no unit)")
     heights = range(0, -len(printed), -1)
     for y, (name, row) in zip(heights, printed.iterrows(), strict=True):
-        axes.plot([row["pred_low"], row["pred_high"]], [y, y], color=MARKS[row["verdict"]]["color"])
-        axes.plot([row["reproduced"]], [y], label=f"ours {name}", markersize=6, **MARKS[row["verdict"]])
-        axes.plot([row["published"]], [y], label=f"printed {name}", marker="*", markersize=9, color=INK)
-    axes.axvline(0, color=MUTED, linewidth=1)
-    axes.set_yticks(list(heights), [feature_symbol(name) for name in printed.index])
-    axes.set_xlabel("weight (no unit)")
+        last.plot([row["pred_low"], row["pred_high"]], [y, y], color=MARKS[row["verdict"]]["color"])
+        last.plot([row["reproduced"]], [y], label=f"ours {name}", markersize=6, **MARKS[row["verdict"]])
+        last.plot([row["published"]], [y], label=f"printed {name}", marker="*", markersize=9, color=INK)
+    last.axvline(0, color=MUTED, linewidth=1)
+    last.set_yticks(list(heights), [feature_symbol(name) for name in printed.index])
     star = Line2D([], [], marker="*", color=INK, linestyle="", markersize=9, label="printed")
-    place: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.17), "ncols": 2, "frameon": False, "columnspacing": 1}
-    axes.legend(handles=[star, *_handles(printed["verdict"].unique(), printed["verdict"])], **place)
+    last.legend(handles=[star, *_handles(printed["verdict"].unique(), printed["verdict"])], ncols=2, **below)
+    return figure
 
 
 def profiles_figure(profiles: pd.DataFrame, settings: pd.DataFrame) -> Figure:
     """How far the loss of notebook 00 rises when one setting is held and all others are fitted again: a panel for each setting.
 
     Between two fits the root of the rise is taken as linear, which is exact for a parabola, as for the intervals of the table.
-
-    Args:
-        profiles: columns setting, value, rise. settings: columns setting, component, low, high, in_parameter_files.
+    `profiles` has the columns setting, value, rise; `settings` setting, component, low, high, in_parameter_files.
     """
     across = 4
     down = -(-len(settings) // across)
@@ -176,12 +156,11 @@ def profiles_figure(profiles: pd.DataFrame, settings: pd.DataFrame) -> Figure:
         axes.plot(drawn, np.interp(drawn, value, root) ** 2, color=INK, label="rise of the loss")
         shown = (value >= ends[0]) & (value <= ends[1])
         axes.plot(value[shown], root[shown] ** 2, "o", color=INK, markersize=3.5, label="fitted again")
-        filed: Any = {"color": MARKS["differs"]["color"], "linestyle": ":", "linewidth": 2}
-        axes.axvline(row.in_parameter_files, label="in the parameter files", **filed)
+        colour = MARKS["differs"]["color"]
+        axes.axvline(row.in_parameter_files, label="in the parameter files", color=colour, linestyle=":", linewidth=2)
         axes.set_title(setting_words(row.setting, row.component), fontsize=9, loc="left")
-        axes.set_ylim(bottom=0)
+        axes.set(label=f"{row.setting} {row.component}", ylim=(0, None))
         axes.xaxis.set_major_locator(MaxNLocator(4))
-        axes.set_label(f"{row.setting} {row.component}")
     for axes in panels[len(settings) :]:
         axes.set_axis_off()
     figure.supxlabel("value of the setting (in its own unit)", fontsize=10)

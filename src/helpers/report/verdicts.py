@@ -20,8 +20,7 @@ KEYS = {"comparison.csv": ["table", "row", "feature"], "tables/claims.csv": ["id
 def recomputed(folder: Path, params_root: Path) -> dict[str, pd.DataFrame]:
     """comparison.csv and tables/claims.csv of a report from the numbers of single seeds, in seeds.csv and tables/claims_seeds.csv.
 
-    Raises:
-        OSError, InputError: where a file is missing, or a parameter file is wrong.
+    OSError where a file is missing, InputError where a parameter file is wrong.
     """
     params, seeds = load(params_root, 1), pd.read_csv(folder / "seeds.csv")
     scale = params.learning.scales[json.loads((folder / "provenance.json").read_text(encoding="utf-8"))["scale"]]

@@ -65,12 +65,9 @@ def refusal(folder, case=1):
 def test_the_committed_files_are_as_printed_and_every_leaf_is_listed(root, case, epochs, iterations, demonstrator):
     params, limits, published = read_all(root, case)
     found = {(row["file"], row["key"]) for row in params.leaves}
-    assert {
-        ("process.yaml", "balance.rate_constant"),
-        ("demonstrators.yaml", "PID2.integral"),
-        ("learning.yaml", "variants.printed.weights.step"),
-        (f"case_{case}.yaml", "online.headline_beta"),
-    } <= found
+    keys = ("balance.rate_constant", "PID2.integral", "variants.printed.weights.step", "online.headline_beta")
+    files = ("process.yaml", "demonstrators.yaml", "learning.yaml", f"case_{case}.yaml")
+    assert set(zip(files, keys, strict=True)) <= found
     assert len(found) == len(params.leaves)
     assert all(set(row) == {"file", "key", *LEAF_KEYS} and row["status"] in STATUSES for row in params.leaves)
     offline, online = params.case.offline, params.case.online
@@ -92,9 +89,7 @@ def test_the_committed_files_are_as_printed_and_every_leaf_is_listed(root, case,
 def test_the_process_is_as_printed(root):
     process = load(root, 1).process
     assert process.drift_state == ((-3.997, -0.446), (-6.092, -1.581))
-    assert process.drift_input == ((0.5, 0.0), (0.0, 0.305))
-    assert process.disturbance == (0.5, 0.3)
-    assert process.horizon == 50
+    assert (process.drift_input, process.disturbance, process.horizon) == (((0.5, 0.0), (0.0, 0.305)), (0.5, 0.3), 50)
 
 
 @pytest.mark.equation("4.2.1")
@@ -110,12 +105,11 @@ def test_scale_of_error(folder, set_point, error_scale, expected):
 
 def test_three_loops_need_no_change_of_code(folder):
     """The parameter files alone know how many variables there are."""
-    names, three, identity = ["a", "b", "c"], [0.1, 0.2, 0.3], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-    words = ("controlled", "manipulated", "controlled_description", "manipulated_description")
-    process = {f"{name}.value": names for name in words}
-    process |= {f"{name}.value": identity for name in ("drift_state", "drift_input")}
-    process |= {f"{name}.value": three for name in ("disturbance", "observation_noise", "input_high")}
-    edit(folder / "process.yaml", process | {"input_low.value": [-1.0, -1.0, -1.0], "balance": DELETE})
+    three, identity = [0.1, 0.2, 0.3], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    words = [f"{kind}{what}" for kind in ("controlled", "manipulated") for what in ("", "_description")]
+    process = {word: ["a", "b", "c"] for word in words} | dict.fromkeys(("drift_state", "drift_input"), identity)
+    process |= dict.fromkeys(("disturbance", "observation_noise", "input_high"), three) | {"input_low": [-1.0, -1.0, -1.0]}
+    edit(folder / "process.yaml", {f"{name}.value": value for name, value in process.items()} | {"balance": DELETE})
     edit(folder / "demonstrators.yaml", {f"PID1.{gain}.value": three for gain in GAINS})
     edit(folder / "learning.yaml", {"policy.error_unit.value": three})
     case = {f"{name}.value": three for name in ("set_point", "initial_mean", "initial_std")}
@@ -130,69 +124,65 @@ def test_numbers_may_be_written_as_people_write_them(folder, text, expected):
     assert load(folder, 1).process.sampling_time == expected
 
 
-VALUES = [  # mistakes: file, key, new values, and what the sentence must say of each of them
-    # mistyped
-    ("process.yaml", "sampling_time", ["1e-3", True, None, [0.04]], "number"),
-    ("process.yaml", "horizon", [50.0, True, "50"], "integer"),
-    ("process.yaml", "disturbance", [0.5, None, []], ""),
-    ("process.yaml", "disturbance", [[0.5, "0.3"]], "number"),
-    ("process.yaml", "controlled", [[1, 2]], "string"),
-    ("process.yaml", "balance.rate_constant", ["3.497"], "number"),
-    ("learning.yaml", "variants.printed.weights.scaled_by_expert", ["no", 1], ""),
-    ("learning.yaml", "policy.hidden_cells", [[20.0, 20]], "integer"),
-    ("case_1.yaml", "demonstrator", [1], "string"),
-    ("limits.yaml", "robustness.load", ["much"], "robustness.load"),
-    # not finite
-    ("process.yaml", "sampling_time", [float("nan")], "finite"),
-    ("case_1.yaml", "set_point", [[float("inf"), 4.0]], "finite"),
-    # out of range
-    ("process.yaml", "sampling_time", [-0.04, 0], "greater than 0"),
-    ("process.yaml", "horizon", [0], "greater than 0"),
-    ("process.yaml", "observation_noise", [[-0.025, 0.025]], "greater than or equal to 0"),
-    ("process.yaml", "input_low", [[20.0, -60.0], [30.0, -60.0]], "below"),
-    ("features.yaml", "discount", [1.5], "less than or equal to 1"),
-    ("features.yaml", "discount", [0.0], "greater than 0"),
-    ("features.yaml", "beta", [-10.0], "greater than 0"),
-    ("features.yaml", "features_on", ["z"], "'x' or 'y'"),
-    ("learning.yaml", "policy.initial_std", [0.5], "std_high"),
-    ("learning.yaml", "policy.error_unit", [[0.0, 0.4]], "greater than 0"),
-    ("learning.yaml", "scales.paper.episodes", [401], "500"),
-    ("learning.yaml", "scales.paper.epoch_share", [1.01], "less than or equal to 1"),
-    ("learning.yaml", "scales.smoke.number_type", ["float16"], "float32"),
-    ("learning.yaml", "variants.improved.weights.averaging", [1.0], "less than 1"),
-    ("learning.yaml", "variants.printed.learner.learning_rate_start", [1e39], ""),
-    ("learning.yaml", "online.learner.credit", ["all"], "reward_to_go"),
-    ("learning.yaml", "online.learner.patience", [-1], "greater than or equal to 0"),
-    ("case_1.yaml", "initial_std", [[-0.25, 0.75]], "greater than or equal to 0"),
-    ("case_1.yaml", "offline.epochs", [0], "greater than 0"),
-    ("case_1.yaml", "offline.iterations", [301], "epochs"),  # every iteration needs an epoch
-    ("case_1.yaml", "online.beta", [[30.0, 0.0]], "greater than 0"),
-    ("case_1.yaml", "demonstrator", ["PID3"], "PID1, PID2"),
-    ("limits.yaml", "attainable.nodes", [0], "attainable.nodes"),
-    ("limits.yaml", "quality.order", [150], "'quality.order': needs more than twice as many samples as 'scales.smoke.at_rest'"),
-    ("limits.yaml", "quality.n_last", [51], "'quality.n_last': exceeds the horizon of 50 samples"),
-    ("limits.yaml", "scales.smoke.listed", [[0, 70]], "multiples of 'every'"),
-    # of the wrong length
-    ("process.yaml", "input_high", [[20.0]], "expected 2"),
-    ("process.yaml", "disturbance", [[0.5, 0.3, 0.1]], "expected 2"),
-    ("process.yaml", "drift_state", [[[-3.997, -0.446]], [[-3.997, -0.446], [-6.092]]], "2"),
-    ("demonstrators.yaml", "PID1.integral", [[48.3]], "expected 2"),
-    ("learning.yaml", "policy.error_unit", [[0.1]], "expected 2"),
-    ("learning.yaml", "variants.printed.weights.initial", [[1.0, -1.0]], "3"),
-    ("case_1.yaml", "set_point", [[-1.0, 4.0, 0.0]], ""),
-    ("case_1.yaml", "steady_state", [[0.0]], "set_point"),
-    ("case_1.yaml", "initial_std", [[0.25]], "expected 2"),
-    ("case_1.yaml", "online.beta", [[30.0]], "expected 2"),
-    ("limits.yaml", "scales.smoke.states", [[11]], "'states' and 'inputs' differ"),
-    ("limits.yaml", "robustness.improve_state", [[1.3]], "'improve_state' and 'improve_input' differ"),
-]
+NAN, INF = float("nan"), float("inf")
+VALUES = {  # mistakes, by file and key: what the sentence must say, and the values of which it says that
+    "process.yaml": {
+        "sampling_time": [("number", "1e-3", True, None, [0.04]), ("finite", NAN), ("greater than 0", -0.04, 0)],
+        "horizon": [("integer", 50.0, True, "50"), ("greater than 0", 0)],
+        "disturbance": [("", 0.5, None, []), ("number", [0.5, "0.3"]), ("expected 2", [0.5, 0.3, 0.1])],
+        "controlled": [("string", [1, 2])],
+        "balance.rate_constant": [("number", "3.497")],
+        "observation_noise": [("greater than or equal to 0", [-0.025, 0.025])],
+        "input_low": [("below", [20.0, -60.0], [30.0, -60.0])],
+        "input_high": [("expected 2", [20.0])],
+        "drift_state": [("expected 2", [[-3.997, -0.446]]), ("length is not 2", [[-3.997, -0.446], [-6.092]])],
+    },
+    "demonstrators.yaml": {"PID1.integral": [("expected 2", [48.3])]},
+    "features.yaml": {
+        "discount": [("less than or equal to 1", 1.5), ("greater than 0", 0.0)],
+        "beta": [("greater than 0", -10.0)],
+        "features_on": [("'x' or 'y'", "z")],
+    },
+    "learning.yaml": {
+        "policy.hidden_cells": [("integer", [20.0, 20])],
+        "policy.initial_std": [("std_high", 0.5)],
+        "policy.error_unit": [("greater than 0", [0.0, 0.4]), ("expected 2", [0.1])],
+        "scales.paper.episodes": [("500", 401)],
+        "scales.paper.epoch_share": [("less than or equal to 1", 1.01)],
+        "scales.smoke.number_type": [("float32", "float16")],
+        "variants.improved.weights.averaging": [("less than 1", 1.0)],
+        "variants.printed.weights.scaled_by_expert": [("boolean", "no", 1)],
+        "variants.printed.weights.initial": [("3", [1.0, -1.0])],
+        "variants.printed.learner.learning_rate_start": [("less than or equal to 1", 1e39)],
+        "online.learner.credit": [("reward_to_go", "all")],
+        "online.learner.patience": [("greater than or equal to 0", -1)],
+    },
+    "case_1.yaml": {
+        "demonstrator": [("string", 1), ("PID1, PID2", "PID3")],
+        "set_point": [("finite", [INF, 4.0]), ("differ in length", [-1.0, 4.0, 0.0])],
+        "steady_state": [("set_point", [0.0])],
+        "initial_std": [("greater than or equal to 0", [-0.25, 0.75]), ("expected 2", [0.25])],
+        "offline.epochs": [("greater than 0", 0)],
+        "offline.iterations": [("epochs", 301)],  # every iteration needs an epoch
+        "online.beta": [("greater than 0", [30.0, 0.0]), ("expected 2", [30.0])],
+    },
+    "limits.yaml": {
+        "robustness.load": [("robustness.load", "much")],
+        "robustness.improve_state": [("'improve_state' and 'improve_input' differ", [1.3])],
+        "attainable.nodes": [("attainable.nodes", 0)],
+        "quality.order": [("'quality.order': needs more than twice as many samples as 'scales.smoke.at_rest'", 150)],
+        "quality.n_last": [("'quality.n_last': exceeds the horizon of 50 samples", 51)],
+        "scales.smoke.listed": [("multiples of 'every'", [0, 70])],
+        "scales.smoke.states": [("'states' and 'inputs' differ", [11])],
+    },
+}
 
 LEAF = [  # the same of the parts of a leaf
-    ("unit", ["s", None], "'time'"),
-    ("source", ["", 3], "source"),
-    ("status", ["guessed", ["reported"]], "reported, inferred, assumed"),
-    ("stauts", ["reported"], "'stauts'"),
-    *((key, [DELETE], f"'{key}'") for key in LEAF_KEYS),
+    *(("unit", value, "'time'") for value in ("s", None)),
+    *(("source", value, "source") for value in ("", 3)),
+    *(("status", value, "reported, inferred, assumed") for value in ("guessed", ["reported"])),
+    ("stauts", "reported", "'stauts'"),
+    *((key, DELETE, f"'{key}'") for key in LEAF_KEYS),
 ]
 
 KEYS = {  # that are deleted, or misspelt
@@ -216,29 +206,23 @@ PARTS = [  # what is no leaf, or no group of them
     ("published.yaml", "case_1.alpha", [0.137, 0.652, -0.067, -0.630, -0.194], ""),  # a weight too few
 ]
 
-OTHERS = [
-    ("demonstrators.yaml", {f"PID1.{gain}.value": [1.0, 2.0, 3.0] for gain in GAINS}, "PID1.proportional", "expected 2"),
-    (
-        "process.yaml",
-        {f"{name}.value": ["a"] for name in ("manipulated", "manipulated_description")}
-        | {"input_low.value": [-1.0], "input_high.value": [1.0], "drift_input.value": [[1.0], [1.0]]},
-        "'manipulated'",
-        "a PID pairs 2 loops",
-    ),
-    *(("case_1.yaml", {"steady_state.value": rest}, "'set_point'", "error_scale") for rest in ([-1.0, 0.0], [0.0, 4.0])),
-]
-
+ONE_INPUT = {f"{name}.value": ["a"] for name in ("manipulated", "manipulated_description")}
+ONE_INPUT |= {"input_low.value": [-1.0], "input_high.value": [1.0], "drift_input.value": [[1.0], [1.0]]}
 MISTAKES = [
-    *((file, {f"{key}.value": value}, key.split(".")[-1], says) for file, key, values, says in VALUES for value in values),
     *(
-        ("process.yaml", {f"sampling_time.{part}": value}, "'sampling_time'", says)
-        for part, values, says in LEAF
+        (file, {f"{key}.value": value}, key.split(".")[-1], says)
+        for file, keys in VALUES.items()
+        for key, mistakes in keys.items()
+        for says, *values in mistakes
         for value in values
     ),
+    *(("process.yaml", {f"sampling_time.{part}": value}, "'sampling_time'", says) for part, value, says in LEAF),
     *((file, {key: DELETE}, f"'{key}'", "missing") for file, keys in KEYS.items() for key in keys),
     *((file, {f"{key}_": leaf(1)}, f"'{key}_'", "unknown") for file, keys in KEYS.items() for key in keys),
     *((file, {key: entry}, key.split(".")[-1], says) for file, key, entry, says in PARTS),
-    *OTHERS,
+    ("demonstrators.yaml", {f"PID1.{gain}.value": [1.0, 2.0, 3.0] for gain in GAINS}, "PID1.proportional", "expected 2"),
+    ("process.yaml", ONE_INPUT, "'manipulated'", "a PID pairs 2 loops"),
+    *(("case_1.yaml", {"steady_state.value": rest}, "'set_point'", "error_scale") for rest in ([-1.0, 0.0], [0.0, 4.0])),
 ]
 
 
@@ -264,21 +248,13 @@ def test_a_key_that_stands_twice_or_is_no_word_is_named(folder, old, new, says):
     assert all(part in sentence for part in ("features.yaml", *says)), sentence
 
 
-CONTENTS = {
-    "empty": b"",
-    "a list": b"- 1\n- 2\n",
-    "unclosed bracket": b"beta: {value: 10.0\n",
-    "tab": b"beta:\n\t- 1\n",
-    "unknown tag": b"beta: !!python/object/apply:os.getcwd []\n",
-    "two documents": b"a: 1\n---\nb: 2\n",
-    "unknown alias": b"a: *b\n",
-    "binary": bytes(range(256)),
-    "control characters": b"beta: \x00\x01\x02\n",
-    "unhashable key": b"{[1, 2]: 3}\n",
-}
+DAMAGED = {"empty": b"", "a list": b"- 1\n- 2\n", "unclosed bracket": b"beta: {value: 10.0\n", "tab": b"beta:\n\t- 1\n"}
+DAMAGED |= {"unknown tag": b"beta: !!python/object/apply:os.getcwd []\n", "two documents": b"a: 1\n---\nb: 2\n"}
+DAMAGED |= {"unknown alias": b"a: *b\n", "unhashable key": b"{[1, 2]: 3}\n"}
+DAMAGED |= {"binary": bytes(range(256)), "control characters": b"beta: \x00\x01\x02\n"}
 
 
-@pytest.mark.parametrize("content", CONTENTS.values(), ids=CONTENTS)
+@pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)
 def test_a_damaged_file_is_named(folder, content):
     for path in (folder / file for file in (*FILES, "case_1.yaml")):
         good = path.read_bytes()

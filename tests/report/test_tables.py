@@ -10,15 +10,11 @@ from helpers.report import tables
 from helpers.settings.paper import load
 
 PARAMS = Path(__file__).resolve().parents[2] / "params"
-TWO = ["h-I", "h-II"]
-
-
-SYMBOLS = {"T": "$T^*$", "C_A": "$C_A^*$", "C_A0": "$C_{A0}^*$", "level_tank_2": r"$\mathrm{level}_{tank,2}^*$"}
 
 
 def test_symbols() -> None:
-    assert {name: tables.symbol(name) for name in SYMBOLS} == SYMBOLS
-    assert tables.feature_symbol("C_A0-III") == "$C_{A0}^*$-III"
+    symbols = {"T": "$T^*$", "C_A": "$C_A^*$", "C_A0": "$C_{A0}^*$", "level_tank_2": r"$\mathrm{level}_{tank,2}^*$"}
+    assert {name: tables.symbol(name) for name in symbols} == symbols
 
 
 def test_table_1_holds_the_conditions_of_the_paper() -> None:
@@ -26,10 +22,10 @@ def test_table_1_holds_the_conditions_of_the_paper() -> None:
     table = tables.table_1({case: entry.case for case, entry in params.items()}, params[1].process)
     loops = ["Concentration of reagent (C_A) control loop", "Reactor temperature (T) control loop"]
     assert list(table.columns) == ["case_study", "system_parameter", *loops]
-    start = ["initial state distribution", "N(0, 0.25)", "N(0, 0.75)"]
-    assert table.to_numpy()[::2].tolist() == [[case, *start] for case in ("I", "II", "III")]
-    set_points = {"I": ["-1", "4"], "II": ["1", "4"], "III": ["-2.5", "3"]}
-    assert table.to_numpy()[1::2].tolist() == [[case, "set point", *target] for case, target in set_points.items()]
+    expected = []
+    for case, *target in (("I", "-1", "4"), ("II", "1", "4"), ("III", "-2.5", "3")):
+        expected += [[case, "initial state distribution", "N(0, 0.25)", "N(0, 0.75)"], [case, "set point", *target]]
+    assert table.to_numpy().tolist() == expected
     assert "Concentration of reagent ($C_A^*$) control loop" in tables.to_markdown(table)
 
 
@@ -51,19 +47,12 @@ def test_spread(numbers: tuple[float, float, float], style: dict, text: str) -> 
     assert tables.spread(dict(zip(("median", "ci_low", "ci_high"), numbers, strict=True)), **style) == text
 
 
-def compared(**changes: object) -> pd.DataFrame:
-    """A comparison of two features, in its columns; alpha of one seed."""
-    rows = []
-    for row, ours in (("expert", 10.0), ("policy", 11.0), ("alpha", 0.61)):
-        for shift, feature in enumerate(TWO):
-            numbers = {"published": ours + shift + 0.5, "reproduced": ours + shift, "ci_low": ours - 1, "ci_high": ours + 1}
-            numbers |= {"pred_low": ours - 2, "pred_high": ours + 2}
-            rows.append({"row": row, "feature": feature, **numbers, "verdict": "match", **changes})
-    return pd.DataFrame(rows)
-
-
 def test_results_table_sets_printed_and_own_numbers_together() -> None:
-    table = tables.results_table(compared(), TWO)
+    ours = [("expert", "h-I", 10.0), ("expert", "h-II", 11.0), ("policy", "h-I", 11.0), ("policy", "h-II", 12.0)]
+    ours += [("alpha", "h-I", 0.61), ("alpha", "h-II", 1.61)]
+    compared = pd.DataFrame(ours, columns=["row", "feature", "reproduced"]).assign(pred_low=8.0, pred_high=12.0, verdict="match")
+    compared["published"] = compared["reproduced"] + 0.5
+    table = tables.results_table(compared, ["h-I", "h-II"])
     assert list(table.columns) == ["quantity", "source", "h-I", "h-II"]
     assert table.to_numpy()[:4].tolist() == [
         ["E[v^E]", "published", "10.50", "11.50"],
@@ -74,7 +63,7 @@ def test_results_table_sets_printed_and_own_numbers_together() -> None:
     assert table["quantity"].unique().tolist() == ["E[v^E]", "E[v^pi]", "alpha*"]
     assert table.iloc[9].tolist() == ["alpha*", "reproduced", "0.610", "1.610"]
     with pytest.raises(KeyError):
-        tables.results_table(compared(), ["h-I", "h-III"])
+        tables.results_table(compared, ["h-I", "h-III"])
 
 
 def medians(rows: list[tuple[int, str, str, float]]) -> pd.DataFrame:
@@ -84,30 +73,22 @@ def medians(rows: list[tuple[int, str, str, float]]) -> pd.DataFrame:
 
 
 def test_quality_table_has_a_row_for_each_figure_of_merit_and_a_column_for_each_controller() -> None:
-    rows = [
-        (1, "expert_paired", "objective_x", 10.0),
-        (1, "online", "objective_x", 18.0),
-        (1, "online", "share", 0.9),
-        (1, "online", "overshoot:T", 0.02),
-        (1, "online", "movement:T_E", 321.0),
-        (1, "online", "episodes", 2000.0),
-    ]
+    rows = [(1, "expert_paired", "objective_x", 10.0), (1, "online", "objective_x", 18.0), (1, "online", "share", 0.9)]
+    rows += [(1, "online", name, value) for name, value in (("overshoot:T", 0.02), ("movement:T_E", 321.0), ("episodes", 2000.0))]
     table = tables.quality_table(medians(rows), load(PARAMS, 1).process).set_index("figure of merit")
     assert list(table) == ["PID", "offline policy", "online policy", "online policy, learned on y", "minimum variance on y"]
     assert table.loc["$J$ on $x$"].tolist() == ["10.00 [9.00, 11.00]", "–", "18.00 [16.20, 19.80]", "–", "–"]
-    assert table.loc["$J$ on $x$, % of minimum variance", "online policy"] == "90.0 [81.0, 99.0]"
-    assert table.loc["overshoot $T^*$, %", "online policy"] == "2.0 [1.8, 2.2]"
-    assert table.loc["movement $T_E^*$", "online policy"] == "321 [289, 353]"
-    assert table.loc["plant episodes spent", "online policy"] == "2000 [1800, 2200]"
+    others = ["$J$ on $x$, % of minimum variance", "overshoot $T^*$, %", "movement $T_E^*$", "plant episodes spent"]
+    shown = ["90.0 [81.0, 99.0]", "2.0 [1.8, 2.2]", "321 [289, 353]", "2000 [1800, 2200]"]
+    assert table.loc[others, "online policy"].tolist() == shown
     assert len(table) == 3 + 2 * 3 + 2 + 1
 
 
 def test_variants_table_has_gap_interval_worst_seed_and_cost() -> None:
     cost = (("epochs", 300.0), ("chosen_epoch", 250.0), ("episodes", 150000.0), ("gradient_steps", 600.0))
     stages = ((2, "offline_printed", 0.2), (1, "offline", 0.01), (1, "online", 0.5))
-    table = tables.variants_table(
-        medians([(case, stage, metric, value) for case, stage, gap in stages for metric, value in (("feature_gap", gap), *cost)])
-    )
+    rows = [(case, stage, *number) for case, stage, gap in stages for number in (("feature_gap", gap), *cost)]
+    table = tables.variants_table(medians(rows))
     assert table.to_numpy().tolist() == [
         ["I", "improved", 7, "1.0 [0.9, 1.1]", "2.0", 300, 250, 150000, 600],
         ["II", "printed", 7, "20.0 [18.0, 22.0]", "40.0", 300, 250, 150000, 600],
@@ -139,16 +120,10 @@ def test_parameters_table_lists_each_parameter_once_and_readably() -> None:
     assert list(table.columns) == ["file", "key", "value", "unit", "source", "status"]
     assert not table.duplicated(["file", "key"]).any()
     value = table.set_index(["file", "key"])["value"]
-    shown = {
-        ("process.yaml", "drift_input"): "[[0.5, 0], [0, 0.305]]",
-        ("process.yaml", "controlled"): "[C_A, T]",
-        ("process.yaml", "horizon"): "50",
-        ("case_1.yaml", "set_point"): "[-1, 4]",
-        ("case_2.yaml", "set_point"): "[1, 4]",
-        ("learning.yaml", "variants.improved.weights.keep_nearest"): "yes",
-        ("learning.yaml", "variants.printed.weights.keep_nearest"): "no",
-    }
-    assert {place: value[place] for place in shown} == shown
+    assert value["process.yaml"][["drift_input", "controlled", "horizon"]].tolist() == ["[[0.5, 0], [0, 0.305]]", "[C_A, T]", "50"]
+    assert [value[f"case_{case}.yaml", "set_point"] for case in (1, 2)] == ["[-1, 4]", "[1, 4]"]
+    flags = [f"variants.{variant}.weights.keep_nearest" for variant in ("improved", "printed")]
+    assert value["learning.yaml"][flags].tolist() == ["yes", "no"]
 
 
 def cells(markdown: str) -> list[list[str]]:
@@ -158,11 +133,9 @@ def cells(markdown: str) -> list[list[str]]:
 def test_markdown_numbers() -> None:
     frame = pd.DataFrame({"v": [21.23456, -0.0671234, 20000.4, np.nan, -1e-9, 0.0], "n_seeds": [1, 20, 300, 4000, 50000, 1234567]})
     assert tables.to_markdown(frame[:0]).startswith("| V")  # an empty table is a header
-    shown = cells(tables.to_markdown(frame))
-    assert shown[0] == ["V", "N seeds"]
-    assert all(cell.endswith("-:") for cell in shown[1])
-    assert [row[0] for row in shown[2:]] == ["21.23", "-0.06712", "20000", "–", "-1e-09", "0"]
-    assert [row[1] for row in shown[2:]] == ["1", "20", "300", "4000", "50000", "1234567"]
+    names, _, *shown = cells(tables.to_markdown(frame))
+    numbers = ["21.23", "-0.06712", "20000", "–", "-1e-09", "0"]
+    assert [names, *shown] == [["V", "N seeds"], *([*row] for row in zip(numbers, frame["n_seeds"].astype(str), strict=True))]
     assert [row[0] for row in cells(tables.to_markdown(frame, digits=2))[2:]] == ["21", "-0.067", "20000", "–", "-1e-09", "0"]
 
 
@@ -174,14 +147,12 @@ def test_columns_of_numbers_and_intervals_stand_to_the_right() -> None:
 
 def test_markdown_text_is_typeset_or_escaped() -> None:
     frame = pd.DataFrame({"C_A-I": ["alpha*", None, "|e| before", "T-II", "a * b <c> $x|y$", "x = 2"], "flag": [True, False] * 3})
-    lines = tables.to_markdown(frame, labels={"flag": "Is it so?"}).splitlines()
-    assert lines[0].startswith("| $C_A^*$-I")
-    assert "Is it so?" in lines[0]
-    for line, expected in zip(
-        lines[2:], (r"$\alpha^*$", "–", r"\|e\| before", "$T^*$-II", r"a \* b \<c> $x|y$", "x = 2"), strict=True
-    ):
-        assert line.startswith(f"| {expected} ")
-    assert [row[-1] for row in cells("\n".join(lines[2:]))] == ["yes", "no"] * 3
+    shown = tables.to_markdown(frame, labels={"flag": "Is it so?"})
+    assert cells(shown)[0] == ["$C_A^*$-I", "Is it so?"]
+    texts = (r"$\alpha^*$", "–", r"\|e\| before", "$T^*$-II", r"a \* b \<c> $x|y$", "x = 2")
+    for line, text in zip(shown.splitlines()[2:], texts, strict=True):
+        assert line.startswith(f"| {text} ")
+    assert [row[-1] for row in cells(shown)[2:]] == ["yes", "no"] * 3
 
 
 def test_fitted_settings_are_told_in_words_and_a_gain_of_no_size_is_none():

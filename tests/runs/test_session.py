@@ -13,6 +13,7 @@ from helpers.runs.request import NOTEBOOK_PARAMETERS, SessionError, check_parame
 from helpers.runs.session import open_session
 from helpers.runs.sources import PROJECT
 from helpers.settings.leaf import ParameterError
+from tests.runs.test_study import session as opened
 
 NOTEBOOKS = sorted(path.stem for path in (PROJECT / "notebooks").glob("[0-9]*.ipynb"))
 OFFLINE, REPORT = "02_offline_irl", "05_report"
@@ -90,7 +91,7 @@ def test_a_wrong_parameter_ends_in_one_sentence(notebook, given, says):
 @pytest.mark.parametrize(("scale", "shown"), [("smoke", "results/smoke/report"), ("paper", "reports/latest"), ("lesson", "")])
 def test_default_roots_do_not_depend_on_the_working_directory(monkeypatch, tmp_path, scale, shown):
     monkeypatch.chdir(tmp_path)
-    session = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, scale=scale))
+    session = opened(scale=scale)
     came_from = PROJECT / ("results" if scale == "paper" else "notebooks/inputs")
     assert (session.input_root, session.output_root, session.params_root) == (came_from, PROJECT / "results", PROJECT / "params")
     if shown:
@@ -100,7 +101,7 @@ def test_default_roots_do_not_depend_on_the_working_directory(monkeypatch, tmp_p
 
 def test_given_roots_are_resolved_once(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    session = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, input_root="here", output_root=str(tmp_path / "there")))
+    session = opened(input_root="here", output_root=str(tmp_path / "there"))
     monkeypatch.chdir("/")
     assert session.folder(session.input_root, "stage") == tmp_path / "here/smoke/seed_0/case_1/stage"
     assert session.folder(session.output_root, "stage", 3) == tmp_path / "there/smoke/seed_0/case_3/stage"
@@ -109,35 +110,29 @@ def test_given_roots_are_resolved_once(monkeypatch, tmp_path):
 def test_the_opening_cell_may_be_run_again_among_other_variables():
     namespace = globals_of_a_kernel(OFFLINE)
     first = open_session(OFFLINE, namespace)
-    namespace |= {"n_rounds": 3, "rows": [1], "session": first, "_session_opened": namespace["_session_opened"]}
+    namespace |= {"n_rounds": 3, "rows": [1], "session": first}
     assert open_session(OFFLINE, namespace).params == first.params
     assert "'seed'" in refusal(open_session, OFFLINE, namespace | {"seed": -1})  # the parameters are still checked
 
 
 def test_the_scale_fixes_number_type_and_threads():
     torch.set_num_threads(2)
-    session = open_session(OFFLINE, globals_of_a_kernel(OFFLINE))
+    session = opened()
     assert torch.get_num_threads() == 1
     assert session.dtype == session.task.set_point.dtype == torch.float64
-    assert open_session(OFFLINE, globals_of_a_kernel(OFFLINE, scale="paper")).dtype == torch.float32
+    assert opened(scale="paper").dtype == torch.float32
 
 
 def test_streams_differ_by_seed_case_and_purpose():
-    draws = [
-        torch.randn(3, generator=open_session(OFFLINE, globals_of_a_kernel(OFFLINE, **given)).stream(purpose)).tolist()
-        for given, purpose in (({}, "a"), ({}, "b"), ({"seed": 1}, "a"), ({"case": 2}, "a"), ({}, "a"))
-    ]
-    assert draws[0] == draws[4]
-    assert len({tuple(draw) for draw in draws}) == 4
+    runs = (({}, "a"), ({}, "a"), ({}, "b"), ({"seed": 1}, "a"), ({"case": 2}, "a"))
+    streams = [opened(**given).stream(purpose) for given, purpose in runs]
+    first, again, *others = (tuple(torch.randn(3, generator=stream).tolist()) for stream in streams)
+    assert first == again
+    assert len({first, *others}) == 4
 
 
-SHOWN = {
-    "alpha:C_A-I": "alpha of <i>C</i><sub>A</sub>-I",
-    "rise_time:T": "rise time of T",
-    "C_A0": "<i>C</i><sub>A0</sub>",
-    "a < b": "a &lt; b",
-    **{same: same for same in ("params/case_1.yaml", "$C_{A0}^*$", "12:30:00")},
-}
+SHOWN = {"alpha:C_A-I": "alpha of <i>C</i><sub>A</sub>-I", "rise_time:T": "rise time of T", "C_A0": "<i>C</i><sub>A0</sub>"}
+SHOWN |= {"a < b": "a &lt; b", **{same: same for same in ("params/case_1.yaml", "$C_{A0}^*$", "12:30:00")}}
 
 
 @pytest.mark.parametrize(("label", "shown"), SHOWN.items())
@@ -149,30 +144,33 @@ def test_a_table_is_shown_in_words_and_four_digits(label, shown):
 
 @pytest.mark.parametrize(("scale", "says"), [("lesson", "This is the lesson"), ("smoke", "smoke run"), ("paper", "scale `paper`")])
 def test_the_banner_says_what_kind_of_run_it_is_and_links_the_full_one(scale, says):
-    shown = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, scale=scale, case=2)).banner().data
+    shown = opened(scale=scale, case=2).banner().data
     assert says in shown
     assert ("(../reports/reference/notebooks/02_offline_irl_case_2.ipynb)" in shown) is (scale != "paper")
     assert "reports/reference/report.html" in open_report(REPORT, globals_of_a_kernel(REPORT)).banner().data
 
 
 def test_a_saved_stage_records_where_it_comes_from(tmp_path):
-    session = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, seed=4, output_root=str(tmp_path)))
+    session = opened(seed=4, output_root=str(tmp_path))
     table = pd.DataFrame({"value": [1 / 3, 123456.789012345]})
     record = session.save("offline_improved", {"t.csv": table}).record
     assert {"notebook": OFFLINE, "case": 1, "seed": 4, "scale": "smoke", "variant": "improved"}.items() <= record.items()
     assert record["inputs"] == session.inputs_now()
     assert {"identity", "upstream", "revision", "versions", "seconds"} <= record.keys()
-    loaded = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, seed=4, input_root=str(tmp_path))).load("offline_improved", "02")
+    loaded = opened(seed=4, input_root=str(tmp_path)).load("offline_improved", "02")
     assert loaded.record == record
     assert loaded.table("t.csv").equals(table)  # display options, which a session sets, do not reach the files
 
 
+TABLE = {"t.csv": pd.DataFrame({"value": [1.0]})}
+
+
 def test_the_seconds_of_the_results_of_one_run_add_up_to_its_own(tmp_path):
-    session, began = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, output_root=str(tmp_path))), time.process_time()
-    first = session.save("offline_improved", {"t.csv": pd.DataFrame({"value": [1.0]})}, last=False).record["seconds"]
+    session, began = opened(output_root=str(tmp_path)), time.process_time()
+    first = session.save("offline_improved", TABLE, last=False).record["seconds"]
     while time.process_time() < began + 0.2:
         pass
-    second = session.save("offline_printed", {"t.csv": pd.DataFrame({"value": [1.0]})}).record["seconds"]
+    second = session.save("offline_printed", TABLE).record["seconds"]
     assert first > 0
     assert second > 0.1
     assert first + second <= time.process_time() - session.clock[0]
@@ -181,23 +179,20 @@ def test_the_seconds_of_the_results_of_one_run_add_up_to_its_own(tmp_path):
 def test_a_run_under_which_code_or_parameters_change_saves_nothing(tmp_path):
     """As the notebook of a killed run may do, that lives on while its user edits and starts again."""
     params = shutil.copytree(PROJECT / "params", tmp_path / "params")
-    given = globals_of_a_kernel(OFFLINE, params_root=str(params), output_root=str(tmp_path / "out"))
-    session = open_session(OFFLINE, given)
+    session = opened(params_root=str(params), output_root=str(tmp_path / "out"))
     learning = params / "learning.yaml"
     before = learning.read_text(encoding="utf-8")
     learning.write_text(before.replace("leaky_slope: {value: 0.01", "leaky_slope: {value: 0.02"), encoding="utf-8")
-    table = {"t.csv": pd.DataFrame({"a": [1]})}
-    assert "params/learning.yaml changed during the run; run it again" in refusal(session.save, "offline_improved", table)
+    assert "params/learning.yaml changed during the run; run it again" in refusal(session.save, "offline_improved", TABLE)
     assert not (tmp_path / "out").exists()
     learning.write_text(f"# a comment\n{before}", encoding="utf-8")
-    assert session.save("offline_improved", table).record["inputs"] == session.made_from
+    assert session.save("offline_improved", TABLE).record["inputs"] == session.made_from
 
 
 def test_a_result_names_the_earlier_results_that_it_read(tmp_path):
-    session = open_session(OFFLINE, globals_of_a_kernel(OFFLINE, output_root=str(tmp_path)))
+    session = opened(output_root=str(tmp_path))
     read = session.load("demonstrations", "01_demonstrations")
-    first = session.save("first", {"t.csv": pd.DataFrame({"a": [1]})}, last=False)
-    second = session.save("second", {"t.csv": pd.DataFrame({"a": [2]})})
+    first, second = session.save("first", TABLE, last=False), session.save("second", {"t.csv": 2 * TABLE["t.csv"]})
     assert first.record["upstream"] == {"case_1/demonstrations": read.content}
     assert second.record["upstream"] == {"case_1/demonstrations": read.content, "case_1/first": first.content}
     assert first.record["identity"] != second.record["identity"]

@@ -86,17 +86,12 @@ def synthetic(root: Path) -> Callable[..., Case]:
             "disturbance": noise, "observation_noise": noise / 10, "steady_state": 0.0, "initial_mean": 0.0, "initial_std": noise,
             "proportional": 2.0, "integral": 1.0, "derivative": 0.0,
         }  # fmt: skip
-        each = {name: (value,) * n_controlled for name, value in each.items()} | {
-            "controlled": tuple(f"y{index}" for index in range(n_controlled)),
-            "manipulated": tuple(f"u{index}" for index in range(n_manipulated)),
-            "drift_state": tuple(map(tuple, drift.tolist())),
-            "drift_input": tuple(map(tuple, mixing.tolist())),
-            "sampling_time": 0.1,
-            "horizon": n_steps,
-            "input_low": (-4.0,) * n_manipulated,
-            "input_high": (6.0,) * n_manipulated,
-            "set_point": tuple(1.0 + index for index in range(n_controlled)),
-        }
+        each = {name: (value,) * n_controlled for name, value in each.items()}
+        each |= {"drift_state": tuple(map(tuple, drift.tolist())), "drift_input": tuple(map(tuple, mixing.tolist()))}
+        each |= {"input_low": (-4.0,) * n_manipulated, "input_high": (6.0,) * n_manipulated}
+        each |= {"set_point": tuple(1.0 + index for index in range(n_controlled)), "sampling_time": 0.1, "horizon": n_steps}
+        for name, letter, number in (("controlled", "y", n_controlled), ("manipulated", "u", n_manipulated)):
+            each[name] = tuple(f"{letter}{index}" for index in range(number))
 
         def changed(record):
             return record.model_copy(update={name: value for name, value in each.items() if name in type(record).model_fields})

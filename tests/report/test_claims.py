@@ -1,5 +1,6 @@
 """Claims: the file, the rule of the verdict, and the numbers it is given."""
 
+import re
 from itertools import product
 
 import numpy as np
@@ -56,10 +57,8 @@ def test_a_mistake_is_one_sentence_that_names_file_and_key(root, tmp_path, chang
     content = yaml.load(root / "claims.yaml")
     content["hot_start"] |= changes
     yaml.dump(content, tmp_path / "claims.yaml")
-    with pytest.raises(ParameterError) as caught:
+    with pytest.raises(ParameterError, match=rf"\A{re.escape(f'{tmp_path}/claims.yaml: {sentence}')}.*\Z"):  # in one line
         load_claims(tmp_path)
-    assert str(caught.value).startswith(f"{tmp_path / 'claims.yaml'}: {sentence}")
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -101,9 +100,9 @@ def test_margins_ratios_and_values(test, margin, against, verdict):
     assert (found.verdict, found.n) == (verdict, 6)
 
 
-@pytest.mark.parametrize(("test", "verdict"), [("not_comparable", "not comparable"), ("by_definition", "holds")])
-def test_what_no_number_decides(test, verdict):
-    assert judge(claim(test, margin=None, quantities={}), paired([]))[:3] == (verdict, "because", 0)
+def test_what_no_number_decides():
+    for test, verdict in (("not_comparable", "not comparable"), ("by_definition", "holds")):
+        assert judge(claim(test, margin=None, quantities={}), paired([]))[:3] == (verdict, "because", 0)
 
 
 def test_seeds_are_compared_in_pairs():
@@ -133,14 +132,12 @@ def test_from_files_to_verdicts(stages):
         "silent": claim("not_comparable", margin=None, quantities={}),
     }
     values = collect(claims, stages)
-    assert values.index.tolist() == [(1, "s/r/m"), (1, "s/r/n")]
-    assert values.notna().to_numpy().sum() == 11
+    assert (values.index.tolist(), values.notna().to_numpy().sum()) == ([(1, "s/r/m"), (1, "s/r/n")], 11)
     table = verdicts(claims, values)
     assert table.columns.tolist() == COLUMNS
     assert table["changed"].tolist() == ["2026-11-29: as it was", "", "", ""]
     assert table["verdict"].tolist() == ["holds", "cannot tell", "cannot tell", "not comparable"]
     assert table["reason"].tolist() == ["the whole interval lies below 0", "not run", "not run", "because"]
-    first = table.iloc[0]
-    assert (first["n"], first["median"], first["test"], first["quantity"]) == (5, -1.0, "difference below 0", "two")
+    assert table.loc[0, ["n", "median", "test", "quantity"]].tolist() == [5, -1.0, "difference below 0", "two"]
     nothing = verdicts(claims, collect(claims, {}))
-    assert nothing[["n", "verdict", "reason"]].to_numpy()[0].tolist() == [0, "cannot tell", "not run"]
+    assert nothing.loc[0, ["n", "verdict", "reason"]].tolist() == [0, "cannot tell", "not run"]

@@ -49,22 +49,17 @@ case,n_seeds,feature_gap,feature_gap_low,feature_gap_high,published_gap,expert_e
 def project(monkeypatch, tmp_path):
     """A project with a finished run."""
     latest, results = tmp_path / "reports/latest", tmp_path / "results"
-    files = dict.fromkeys(
-        ("report.html", "report.pdf", "report.md", "figures/figure_3.png", "tables/table_2.csv", "comparison.csv")
-    )
-    files |= {
-        "tables/time.csv": "case,stage,seconds\n1,demonstrations,2.4\n2,demonstrations,3.6\n1,offline_improved,20.2\n",
-        "tables/gaps.csv": GAPS,
-        "seeds.csv": "case,seed,stage,metric,value\n1,0,offline,feature_gap,0.2\n",
-        "provenance.json": json.dumps(GOOD),
-    }
+    parts = ("report.html", "report.pdf", "report.md", "figures/figure_3.png", "tables/table_2.csv", "comparison.csv")
+    files = {part: part for part in parts} | {"tables/gaps.csv": GAPS, "provenance.json": json.dumps(GOOD)}
+    files["tables/time.csv"] = "case,stage,seconds\n1,demonstrations,2.4\n2,demonstrations,3.6\n1,offline_improved,20.2\n"
+    files["seeds.csv"] = "case,seed,stage,metric,value\n1,0,offline,feature_gap,0.2\n"
     copies = (  # also of a trial, of a killed run, and of another seed
         *("reports/latest/notebooks/05_report", "results/paper/seed_0/notebooks/07_your_own_process"),
         *(f"results/paper/seed_0/case_1/notebooks/02_offline_irl_{variant}" for variant in ("improved", "printed", "whole_return")),
         *(f"results/paper/seed_0/case_3/notebooks/{name}" for name in ("01_demonstrations", ".01_demonstrations.123")),
         "results/paper/seed_1/case_3/notebooks/01_demonstrations",
     )
-    pages = {latest / name: text or name for name, text in files.items()}
+    pages = {latest / name: text for name, text in files.items()}
     pages |= {tmp_path / f"{copy}.ipynb": json.dumps({"cells": [], "metadata": {"what": copy}}) for copy in copies}
     pages |= {tmp_path / "README.md": README, tmp_path / "docs/running.md": RUNNING}
     for path, text in pages.items():

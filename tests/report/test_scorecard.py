@@ -1,5 +1,7 @@
 """The verdict rule and its edges, and medians, gaps and lists against cases built by hand."""
 
+from itertools import product
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -17,27 +19,24 @@ MEASURED = {"expert": 20000, "policy": 2000}
 SPREAD = 3.0  # of the features over trajectories
 
 
-def seeds(n_seeds: int = 6) -> pd.DataFrame:
+def seeds(n_seeds=6):
     """Case 4: policies at 11 and 2.0 more or less; the last seed lacks its weights."""
     rows = []
     for seed in range(n_seeds):
         shift = 0.1 * (seed - (n_seeds - 1) / 2)
         rows += [(4, seed, "expert", "v:h-I", 10.5 + shift), (4, seed, "expert", "v:h-II", -2.2)]
-        rows += [
-            (4, seed, "offline", "v:h-I", 11.0 + shift),
-            (4, seed, "offline", "v:h-II", -2.0),
-            (4, seed, "online", "v:h-I", 99.0),
-        ]
+        rows += [(4, seed, "offline", "v:h-I", 11.0 + shift), (4, seed, "offline", "v:h-II", -2.0)]
+        rows += [(4, seed, "online", "v:h-I", 99.0), (4, seed, "online", "objective_x", 9.0 + seed / 10)]
         rows += [(4, seed, "offline", "feature_gap", 0.02 + seed / 100), (1, seed, "offline", "feature_gap", 0.9)]
-        rows += [(4, seed, "online", "objective_x", 9.0 + seed / 10), (4, seed, "minimum_variance", "objective_x", 10.0)]
+        rows += [(4, seed, "minimum_variance", "objective_x", 10.0)]
         rows += [(4, seed, stage, f"v:{name}:std", SPREAD) for stage in ("expert", "offline") for name in TWO]
         if seed < n_seeds - 1:
             rows += [(4, seed, "offline", "alpha:h-I", 0.61 + shift / 10), (4, seed, "offline", "alpha:h-II", -0.7)]
     return pd.DataFrame(rows, columns=["case", "seed", "stage", "metric", "value"])
 
 
-def compare(runs: pd.DataFrame, published=None, names=None) -> pd.DataFrame:
-    return scorecard.comparison(published or SMALL, runs, scorecard.summary(runs), names or TWO, MEASURED)
+def compare(runs, published=SMALL, names=TWO, measured=MEASURED, errors=None):
+    return scorecard.comparison(published, runs, scorecard.summary(runs), names, measured, errors)
 
 
 @pytest.mark.parametrize(
@@ -80,10 +79,10 @@ def test_summary_has_the_median_and_its_interval_for_every_number():
 def test_comparison_holds_intervals_of_the_median_and_of_one_run():
     table = compare(seeds())
     assert list(table.columns) == scorecard.COLUMNS
-    rows = [(row, name) for row in ("expert", "policy", "alpha") for name in TWO]
-    assert table[["table", "case", "row", "feature"]].to_numpy().tolist() == [[9, 4, *place] for place in rows]
-    assert table["published"].tolist() == [10.0, -2.0, 11.0, -2.5, 0.6, -0.8]
-    assert table["n_seeds"].tolist() == [6, 6, 6, 6, 5, 5]
+    places = [[9, 4, *place] for place in product(("expert", "policy", "alpha"), TWO)]
+    assert table[["table", "case", "row", "feature"]].to_numpy().tolist() == places
+    numbers = [[10.0, -2.0, 11.0, -2.5, 0.6, -0.8], [6, 6, 6, 6, 5, 5]]
+    assert [table[name].tolist() for name in ("published", "n_seeds")] == numbers
     assert table["reproduced"].tolist() == pytest.approx([10.5, -2.2, 11.0, -2.0, 0.605, -0.7])
     assert table["verdict"].tolist() == ["fitted", "fitted", "match", "differs", "match", "differs"]
     assert table.loc[3, ["ci_low", "ci_high"]].tolist() == [-2.0, -2.0]
@@ -97,7 +96,7 @@ def test_the_sampling_error_that_ours_lack_is_added_to_features_only():
         ours = table.loc[(row, "h-II"), "reproduced"]
         assert (table.loc[(row, "h-II"), ["pred_low", "pred_high"]] - ours).tolist() == pytest.approx([-reach, reach], rel=1e-6)
     assert table.loc[("alpha", "h-II"), ["pred_low", "pred_high"]].tolist() == pytest.approx([-0.7, -0.7])
-    fewer = scorecard.comparison(SMALL, seeds(), scorecard.summary(seeds()), TWO, {"expert": 500, "policy": 100})
+    fewer = compare(seeds(), measured={"expert": 500, "policy": 100})
     assert fewer.loc[3, ["pred_low", "pred_high"]].tolist() == [-2.0, -2.0]  # never less than the runs' own
 
 
@@ -109,7 +108,7 @@ def test_another_sampling_error_may_change_a_verdict():
     prediction = prediction.assign(published=-2.0, simulated=-1.7, deviation=1.0)
     errors = scorecard.sampling_errors(prediction, SMALL)
     assert errors == {(4, "h-III"): pytest.approx(0.3)}
-    ours, wider = (scorecard.comparison(SMALL, runs, scorecard.summary(runs), names, MEASURED, found) for found in (None, errors))
+    ours, wider = (compare(runs, names=names, errors=found) for found in (None, errors))
     found = scorecard.changed(ours, wider)[["row", "feature", "verdict", "verdict_with_the_wider_error"]]
     assert found.to_numpy().tolist() == [["policy", "h-III", "differs", "match"]]
     assert scorecard.outside(ours) == {"match": 0, "differs": 2, "cannot tell": 0, "fitted": 0}
@@ -127,28 +126,24 @@ def test_comparison_has_a_row_for_each_published_number_even_if_nobody_reproduce
     assert [set(table[name]) for name in ("n_seeds", "verdict", "reason")] == [{0}, {"fitted", "cannot tell"}, {"no seed gave it"}]
 
 
-def with_ratios(runs: pd.DataFrame, published=None, names=None) -> pd.DataFrame:
-    return pd.concat([runs, scorecard.relative(runs, published or SMALL, names or TWO)], ignore_index=True)
+def with_ratios(runs, published=SMALL, names=TWO):
+    return scorecard.summary(pd.concat([runs, scorecard.relative(runs, published, names)], ignore_index=True))
 
 
-def test_ratios_of_each_seed():
+def test_ratios_of_each_seed_and_the_gaps_over_seeds():
     added = scorecard.relative(seeds(2), SMALL, TWO).set_index(["stage", "metric"])["value"]
     assert added["expert", "published_error"].tolist() == pytest.approx([(error / 10 + 0.2 / 2) / 2 for error in (0.45, 0.55)])
     assert added["online", "share"].tolist() == pytest.approx([0.90, 0.91])
     assert added["minimum_variance", "share"].tolist() == [1.0, 1.0]
     assert len(added) == 6
-
-
-def test_gaps():
-    row = scorecard.gaps(scorecard.summary(with_ratios(seeds())), SMALL).iloc[0]
+    row = scorecard.gaps(with_ratios(seeds()), SMALL).iloc[0]
     assert (row["case"], row["n_seeds"]) == (4, 6)
     assert row[["feature_gap", "feature_gap_greatest"]].tolist() == pytest.approx([0.045, 0.07])
     assert 0.02 <= row["feature_gap_low"] < 0.045 < row["feature_gap_high"] <= 0.07
     others = [(1 / 10 + 0.5 / 2) / 2, (0.5 / 10 + 0.2 / 2) / 2, 0.925]
     assert row[["published_gap", "expert_error", "online_share"]].tolist() == pytest.approx(others)
     assert row["online_share_low"] < 0.925 < row["online_share_high"]
-    # Of the paper, and of seeds that are missing.
-    table = scorecard.gaps(scorecard.summary(with_ratios(seeds(1).query("case == 4"), PAPER, FEATURES)), PAPER)
+    table = scorecard.gaps(with_ratios(seeds(1).query("case == 4"), PAPER, FEATURES), PAPER)  # of seeds that are missing
     assert (100 * table["published_gap"]).round(1).tolist() == [3.7, 13.7, 11.5]
     assert table["n_seeds"].tolist() == [0, 0, 0]
     assert table[["feature_gap", "expert_error", "online_share"]].isna().all(axis=None)

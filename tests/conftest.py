@@ -37,13 +37,7 @@ class Case(Study):
         return LSTMPolicy.initial(self.params.learning.policy.model_copy(update=changes), self.task, stream(seed, "policy"))
 
     def learner(
-        self,
-        policy: LSTMPolicy,
-        n_episodes: int,
-        n_epochs: int,
-        params: LearnerParams,
-        draws: torch.Generator | int = 0,
-        *more: Any,
+        self, policy: LSTMPolicy, n_episodes: int, n_epochs: int, params: LearnerParams, draws: Any = 0, *more: Any
     ) -> Learner:
         """A learner for that policy; `draws`: its generator, or the seed of one."""
         generator = stream(draws, "learner") if isinstance(draws, int) else draws
@@ -66,9 +60,7 @@ def root() -> Path:
 def study(root: Path) -> Callable[..., Case]:
     """Case study `case`; changes replace entries of process.yaml (`process`) or of the case file (`case_study`)."""
 
-    def build(
-        case: int = 1, dtype: torch.dtype = torch.float64, process: dict | None = None, case_study: dict | None = None
-    ) -> Case:
+    def build(case: int = 1, dtype: torch.dtype = torch.float64, process: Any = None, case_study: Any = None) -> Case:
         return of(load(root, case), dtype).varied(process=process or {}, case=case_study or {})
 
     return build

@@ -29,7 +29,6 @@ from helpers.plant.rollout import rollout, stream
 from helpers.report.claims import load_claims
 from helpers.runs import identity
 from helpers.runs.artifacts import load_stage, save_stage, trajectories_from_table, trajectories_to_table
-from helpers.runs.identity import inputs
 from helpers.runs.sources import PROJECT
 from helpers.settings.evidence import load_experiments, load_identification
 from helpers.settings.leaf import InputError, read_yaml
@@ -74,22 +73,11 @@ SCALARS = st.none() | st.booleans() | NUMBERS | st.integers(-9, 9) | st.floats(w
 KEYS = st.text(max_size=5) | st.integers(0, 3)
 ANYTHING = st.recursive(SCALARS, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(KEYS, inner, max_size=3), max_leaves=6)
 BOMB = "\n".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9) if n else 'x'}]" for n in range(30))
-LINES = [
-    "!!python/object/apply:os.system ['touch exploded']",
-    "extra: !!python/object/new:os.system ['touch exploded']",
-    "extra: !!python/name:os.system",
-    "extra: !unknown x",
-    "extra: &a [*a]",
-    "extra: {<<: *nowhere}",
-    f"extra: {'[' * 3000}",
-    "extra: 1\nextra: 2",
-    "? [a, b]\n: c",
-    "--- second document",
-    "\t- tab",
-    "extra: \x07",
-    "extra: 0x1F",
-    BOMB,
-]
+LINES = ["!!python/object/apply:os.system ['touch exploded']", "extra: !!python/object/new:os.system ['touch exploded']"]
+LINES += ["extra: !!python/name:os.system", "extra: !unknown x", "extra: &a [*a]", "extra: {<<: *nowhere}", "extra: 1\nextra: 2"]
+LINES += [f"extra: {'[' * 3000}", "? [a, b]\n: c", "--- second document", "\t- tab", "extra: \x07", "extra: 0x1F", BOMB]
+DTYPES = st.sampled_from([torch.float32, torch.float64])
+CELLS = st.floats() | st.integers() | st.text(max_size=5) | st.none() | st.booleans() | st.sampled_from(["1e999", "0x1", "1_000"])
 
 
 def nodes(content, path=()):
@@ -134,17 +122,13 @@ def parameter_files(draw):
 def load_everything(root):
     """Every loader of parameter files, as the notebooks use them."""
     params = {case: load(root, case) for case in (1, 2, 3)}
-    load_published(root)
-    load_experiments(root, params[1])
-    load_identification(root, params[1])
-    load_claims(root)
-    load_limits(root, params[1])
-    load_one_policy(root, params[1])
-    load_search(root)
-    load_own_plant(root)
+    for load_whole in (load_published, load_claims, load_search, load_own_plant):
+        load_whole(root)
+    for load_for in (load_experiments, load_identification, load_limits, load_one_policy):
+        load_for(root, params[1])
     load_tank(root, params[1].process)
     for notebook, case in NOTEBOOKS.items():
-        inputs(notebook, root, "smoke", case)
+        identity.inputs(notebook, root, "smoke", case)
 
 
 @pytest.fixture
@@ -221,10 +205,6 @@ def test_mutated_artifacts(stage_of, monkeypatch, data, name, sealed):
     if policy is not None:
         assert all(tensor.isfinite().all() for tensor in policy.state_dict().values())
     assert not (folder.parent / "exploded").exists()
-
-
-DTYPES = st.sampled_from([torch.float32, torch.float64])
-CELLS = st.floats() | st.integers() | st.text(max_size=5) | st.none() | st.booleans() | st.sampled_from(["1e999", "0x1", "1_000"])
 
 
 @pytest.fixture(scope="module")

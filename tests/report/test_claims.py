@@ -14,6 +14,16 @@ from helpers.runs.request import PROJECT
 from helpers.settings.leaf import ParameterError
 
 BASE = {"section": "1", "statement": "so it is", "cases": (1,), "margin": 0.0, "why": "because"}
+MISTAKES = [
+    ({"margin": None}, "key 'hot_start': the test 'difference_below' needs 'margin' and 'quantities'"),
+    ({"test": "larger"}, "key 'hot_start.test'"),
+    ({"test": "value_below"}, "key 'hot_start': the test 'value_below' needs no 'against'"),
+    ({"test": "not_comparable"}, "key 'hot_start': the test 'not_comparable' has neither 'margin' nor 'quantities'"),
+    ({"changed": "because"}, "key 'hot_start.changed'"),
+    ({"margins": 1}, "key 'hot_start.margins': the key is unknown"),
+    ({"quantities": {"x": {"value": "no reference"}}}, "key 'hot_start.quantities.x.value'"),
+    ({"quantities": {"x": {"value": "a/b/c"}}}, "key 'hot_start': the test 'difference_below' needs an 'against' in 'x'"),
+]
 
 
 def claim(test="difference_below", **changes):
@@ -39,19 +49,7 @@ def test_every_number_of_the_ordinary_stages_is_one_that_they_write(root):
         assert set(product(entry.cases, needed)) <= known, name
 
 
-@pytest.mark.parametrize(
-    ("changes", "sentence"),
-    [
-        ({"margin": None}, "key 'hot_start': the test 'difference_below' needs 'margin' and 'quantities'"),
-        ({"test": "larger"}, "key 'hot_start.test'"),
-        ({"test": "value_below"}, "key 'hot_start': the test 'value_below' needs no 'against'"),
-        ({"test": "not_comparable"}, "key 'hot_start': the test 'not_comparable' has neither 'margin' nor 'quantities'"),
-        ({"changed": "because"}, "key 'hot_start.changed'"),
-        ({"margins": 1}, "key 'hot_start.margins': the key is unknown"),
-        ({"quantities": {"x": {"value": "no reference"}}}, "key 'hot_start.quantities.x.value'"),
-        ({"quantities": {"x": {"value": "a/b/c"}}}, "key 'hot_start': the test 'difference_below' needs an 'against' in 'x'"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "sentence"), MISTAKES)
 def test_a_mistake_is_one_sentence_that_names_file_and_key(root, tmp_path, changes, sentence):
     yaml = YAML(typ="safe", pure=True)
     content = yaml.load(root / "claims.yaml")
@@ -61,19 +59,13 @@ def test_a_mistake_is_one_sentence_that_names_file_and_key(root, tmp_path, chang
         load_claims(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("values", "verdict"),
-    [
-        ([-1, -2, -3, -4, -5], "holds"),
-        ([1, 2, 3, 4, 5], "does not hold"),
-        ([-3, -2, 1, 2, 3], "cannot tell"),
-        ([0, 0, 0, 0, 0], "does not hold"),  # no better is not better
-        ([-1, -2, -3, -4], "cannot tell"),  # four seeds
-        ([-1, -2, -3, -4, np.nan], "cannot tell"),
-        ([-1, -2, -3, -4, -5, np.nan], "holds"),
-        ([], "cannot tell"),
-    ],
-)
+FOUR = [-1, -2, -3, -4]  # seeds are too few
+SAID = [([*FOUR, -5], "holds"), ([*FOUR, -5, np.nan], "holds"), ([1, 2, 3, 4, 5], "does not hold")]
+SAID += [([0, 0, 0, 0, 0], "does not hold")]  # no better is not better
+SAID += [(values, "cannot tell") for values in ([-3, -2, 1, 2, 3], FOUR, [*FOUR, np.nan], [])]
+
+
+@pytest.mark.parametrize(("values", "verdict"), SAID)
 @pytest.mark.parametrize("shift", [0.0, 3.5])
 def test_verdicts_of_a_difference_below(values, verdict, shift):
     found = judge(claim(), paired(np.add(values, shift), shift))
@@ -85,16 +77,11 @@ def test_verdicts_of_a_difference_below(values, verdict, shift):
     assert (found.reason == "a tie") == (values == [0, 0, 0, 0, 0])
 
 
-@pytest.mark.parametrize(
-    ("test", "margin", "against", "verdict"),
-    [
-        ("ratio_above", 0.9, 2.0, "holds"),
-        ("ratio_below", 0.9, 2.0, "does not hold"),
-        ("ratio_below", 1.25, 2.0, "cannot tell"),
-        ("value_above", 1.9, 0.0, "holds"),
-        ("value_below", 1.9, 0.0, "does not hold"),
-    ],
-)
+JUDGED = [("ratio_above", 0.9, 2.0, "holds"), ("ratio_below", 0.9, 2.0, "does not hold"), ("ratio_below", 1.25, 2.0, "cannot tell")]
+JUDGED += [("value_above", 1.9, 0.0, "holds"), ("value_below", 1.9, 0.0, "does not hold")]
+
+
+@pytest.mark.parametrize(("test", "margin", "against", "verdict"), JUDGED)
 def test_margins_ratios_and_values(test, margin, against, verdict):
     found = judge(claim(test, margin=margin), paired([2.0, 2.2, 2.4, 2.6, 2.8, 3.0], against))
     assert (found.verdict, found.n) == (verdict, 6)

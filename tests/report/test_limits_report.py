@@ -102,15 +102,11 @@ def test_several_seeds_show_medians(results):
     assert first == {"model": [50.0, 100.0, 100.0], "set points": [40.0, 100.0, 120.0]}
 
 
-@pytest.mark.parametrize(
-    ("times", "shown"),
-    [
-        ([0.1, 0.2, 0.3, 0.4, None], "0.30 [0.10, –]"),
-        ([0.1, 0.2, None, None, None], "–"),
-        ([0.1, 0.2, None, None], "–"),  # one of the two in the middle never came there
-        ([0.2] * 5, "0.20"),
-    ],
-)
+TIMES = [([0.1, 0.2, 0.3, 0.4, None], "0.30 [0.10, –]"), ([0.1, 0.2, None, None, None], "–"), ([0.2] * 5, "0.20")]
+TIMES += [([0.1, 0.2, None, None], "–")]  # one of the two in the middle never came there
+
+
+@pytest.mark.parametrize(("times", "shown"), TIMES)
 def test_what_a_seed_never_reached_counts_as_long(times, shown):
     rows = pd.DataFrame({"case": 1, "seed": range(len(times)), "controller": "mpc", "metric": "rise_time:T", "value": times})
     table = limits_report._quality(rows, limits_report.QUALITY["response"])
@@ -118,16 +114,13 @@ def test_what_a_seed_never_reached_counts_as_long(times, shown):
 
 
 def test_what_several_seeds_say(results):
-    """Improving on the plant reaches 10 to 14 in Case I and 20 to 24 in Case II; minimum variance has 15 there, the MPC 18.
-
-    The searches for gains end at 5 to 7 in Case I and at 10 to 12 in Case II, from 10.
-    """
+    """Improving on the plant reaches 10 to 14 in Case I and 20 to 24 in Case II; minimum variance has 15 there, the MPC 18."""
     assert limits_findings.there(results(4)) == {}  # too few for an interval
     behind = ["offset-free MPC", "minimum variance on y"]
     assert limits_findings.there(results(5)) == {"A x 1.3, B x 0.7": {1: behind, 2: []}}
     assert limits_findings.standings(results(1)) == {}
     assert limits_findings.standings(results(5)) == {0: {"ppo": {"ahead": [1, 2]}}, 500: {"ppo": {"ahead": [1, 2]}}}
-    found = limits_findings.tuned(results(3))
+    found = limits_findings.tuned(results(3))  # the searches for gains end at 5 to 7 in Case I, 10 to 12 in Case II, from 10
     assert found[1] == {"better": 0, "seeds": 3, "least": 5.0, "greatest": 6.0}
     assert found[2] == {"better": 1, "seeds": 3, "least": 10.0, "greatest": 11.0}
 
@@ -143,15 +136,9 @@ def test_what_one_seed_says(results):
     assert found["seeds"] == {1: 1, 2: 1}
     assert found["attainable"][2] == pytest.approx({"look_ahead": 1.0, "noise": 5.0, "filter": 2.5})
     assert found["agreement"] == pytest.approx(0.2)  # of the last grid only
-    assert found["practice"] == {
-        "with_model": pytest.approx({1: 150, 2: 100 * 18 / 22}),  # 18 against 12 and 22
-        "never_below": ["offset-free MPC"],
-        "least": (40.0, 40.0),
-        "without_model": {500: {"PPO from scratch": [1, 2]}},
-        "budget": 500,
-        "steady": ["IRL, then policy gradient"],
-        "kept": 0.9,
-    }
+    practice = {"with_model": pytest.approx({1: 150, 2: 100 * 18 / 22})}  # 18 against 12 and 22
+    practice |= {"without_model": {500: {"PPO from scratch": [1, 2]}}, "budget": 500, "steady": ["IRL, then policy gradient"]}
+    assert found["practice"] == practice | {"never_below": ["offset-free MPC"], "least": (40.0, 40.0), "kept": 0.9}
     assert found["not_found"] == {case: ["PPO from scratch ($C_A^*$)"] for case in (1, 2)}  # loops that it never found
     assert found["ranges"] == "A and B times 1 to 2 and 0.7 to 1; the set points of the two loops times 1.25 to 1.25 and 1 to 1"
     assert (found["price"][1]["worse"], found["price"][2]["model"]) == (50.0, 80.0)

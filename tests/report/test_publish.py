@@ -26,15 +26,6 @@ REFUSED = {
     "seeds that failed": ({"missing_seeds": [3, 7]}, None, REVISION, "lacks the seeds 3, 7"),
     "no checkout": ({"revision": "unknown", "revisions_of_stages": ["unknown"]}, None, "unknown", "unknown"),
 }
-
-
-@pytest.mark.parametrize(("changes", "reference", "revision", "says"), REFUSED.values(), ids=REFUSED)
-def test_only_a_clean_run_at_paper_scale_is_accepted(changes, reference, revision, says):
-    check(GOOD, {"seeds": [0, 1]}, REVISION)
-    with pytest.raises(PublishError, match=rf"\A.*{re.escape(says)}.*\Z"):  # in one line
-        check(GOOD | changes, reference, revision)
-
-
 README = "# Title\n<!-- glance: a -->\nold\n<!-- /glance -->\nmiddle\n<!-- cost: d -->\n<!-- /cost -->\n"
 README += "<!-- limits: c -->\n<!-- /limits -->\nend\n"
 RUNNING = "# Running it\n<!-- time: b -->\n<!-- /time -->\nend\n"
@@ -43,6 +34,29 @@ case,n_seeds,feature_gap,feature_gap_low,feature_gap_high,published_gap,expert_e
 1,20,0.2,0.15,0.31,0.1,0.01,0.009,0.012,0.951,0.4
 2,20,0.03,0.02,0.04,0.137,0.02,0.02,0.02,,
 """
+COPY, LATEST = "results/paper/seed_0/case_1/notebooks/02_offline_irl_printed", "reports/latest"
+NOWHERE = "nowhere"  # a link to it cannot be copied
+FAULTS = {  # what is written, None for a file that is missing; the exit status, and what is said
+    "no report": (f"{LATEST}/provenance.json", None, 2, "there is no report"),
+    "smoke": (f"{LATEST}/provenance.json", json.dumps(GOOD | {"scale": "smoke"}), 2, "only paper scale is published"),
+    "no marks in README": ("README.md", "no marks", 2, "the marks of the block 'glance' must stand on one page, not on 0"),
+    "a failed copy": (f"{COPY}.failed", "ZeroDivisionError", 2, f"{COPY}.ipynb: failed when it was run last"),
+    "a failed report": (f"{LATEST}/notebooks/05_report.failed", "x", 2, "05_report.ipynb: failed when it was run last"),
+    "no claims": ("reports/reference/tables/claims.csv", "", 2, "lacks tables/claims.csv, which the published one has"),
+    "no limits": ("reports/reference/tables/limits_gaps.csv", "", 2, "lacks tables/limits_gaps.csv, which the published one has"),
+    "a dangling link": (f"{LATEST}/figures/gone.png", NOWHERE, 1, "figures/gone.png: could not be published: "),
+    **{
+        f"no {part}": (f"{LATEST}/{part}", None, 1, f"{LATEST}/{part}: could not be published: No such file")
+        for part in ("figures", "seeds.csv", "tables/time.csv", "notebooks/05_report.ipynb")
+    },
+}
+
+
+@pytest.mark.parametrize(("changes", "reference", "revision", "says"), REFUSED.values(), ids=REFUSED)
+def test_only_a_clean_run_at_paper_scale_is_accepted(changes, reference, revision, says):
+    check(GOOD, {"seeds": [0, 1]}, REVISION)
+    with pytest.raises(PublishError, match=rf"\A.*{re.escape(says)}.*\Z"):  # in one line
+        check(GOOD | changes, reference, revision)
 
 
 @pytest.fixture
@@ -132,24 +146,6 @@ def refused(capsys, status):
     return said
 
 
-COPY, LATEST = "results/paper/seed_0/case_1/notebooks/02_offline_irl_printed", "reports/latest"
-NOWHERE = "nowhere"  # a link to it cannot be copied
-FAULTS = {  # what is written, None for a file that is missing; the exit status, and what is said
-    "no report": (f"{LATEST}/provenance.json", None, 2, "there is no report"),
-    "smoke": (f"{LATEST}/provenance.json", json.dumps(GOOD | {"scale": "smoke"}), 2, "only paper scale is published"),
-    "no marks in README": ("README.md", "no marks", 2, "the marks of the block 'glance' must stand on one page, not on 0"),
-    "a failed copy": (f"{COPY}.failed", "ZeroDivisionError", 2, f"{COPY}.ipynb: failed when it was run last"),
-    "a failed report": (f"{LATEST}/notebooks/05_report.failed", "x", 2, "05_report.ipynb: failed when it was run last"),
-    "no claims": ("reports/reference/tables/claims.csv", "", 2, "lacks tables/claims.csv, which the published one has"),
-    "no limits": ("reports/reference/tables/limits_gaps.csv", "", 2, "lacks tables/limits_gaps.csv, which the published one has"),
-    "a dangling link": (f"{LATEST}/figures/gone.png", NOWHERE, 1, "figures/gone.png: could not be published: "),
-    **{
-        f"no {part}": (f"{LATEST}/{part}", None, 1, f"{LATEST}/{part}: could not be published: No such file")
-        for part in ("figures", "seeds.csv", "tables/time.csv", "notebooks/05_report.ipynb")
-    },
-}
-
-
 @pytest.mark.parametrize(("path", "text", "status", "says"), FAULTS.values(), ids=FAULTS)
 def test_a_run_that_is_refused_or_lacks_a_part_ends_in_a_sentence_and_changes_nothing(published, capsys, path, text, status, says):
     if text is None:
@@ -202,14 +198,12 @@ def test_git_sees_nothing_of_what_a_kill_leaves_beside_the_reference():
     assert ignored.stdout.split() == left
 
 
-@pytest.mark.parametrize(
-    ("link", "leads"),
-    [
-        ("[code](../src/helpers/x.py)", "[code](../../../src/helpers/x.py)"),
-        ("[next](03_online_improvement.ipynb)", "[next](../../../notebooks/03_online_improvement.ipynb)"),
-        ("[paper](https://doi.org/10.1002/x)", "[paper](https://doi.org/10.1002/x)"),
-    ],
-)
+LINKS = {"[code](../src/helpers/x.py)": "[code](../../../src/helpers/x.py)"}
+LINKS |= {"[next](03_online_improvement.ipynb)": "[next](../../../notebooks/03_online_improvement.ipynb)"}
+LINKS |= {"[paper](https://doi.org/10.1002/x)": "[paper](https://doi.org/10.1002/x)"}
+
+
+@pytest.mark.parametrize(("link", "leads"), LINKS.items())
 def test_an_executed_copy_leads_where_the_notebook_led_and_holds_a_table_once(link, leads):
     data = {"text/html": "<table>", "text/plain": "a table"}
     cells = [{"source": f"See {link}, and {link}."}, {"source": "", "outputs": [{"data": data}, {"data": {"text/plain": "7"}}]}]

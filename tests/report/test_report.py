@@ -20,6 +20,11 @@ CASES = (1, 2, 3)
 FEATURES = ["C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III"]
 INPUTS, PARAMS = PROJECT / "notebooks/inputs", PROJECT / "params"
 RESOURCES = {"src", "data", "srcset", "poster", "background"}
+MISSING = {2: {"demonstrations": "01"}, 1: {"offline_printed": "02"}}
+MISSING |= {3: {"transfer_improved": "04", "online_improved": "03 (04 for the transfer case)"}}
+MIXTURES = {("inputs", name): name for name in ("src/helpers/learning/lstm.py", "torch")}
+MIXTURES |= {("upstream", "case_2/demonstrations"): "seed_0/case_2/demonstrations", ("seed",): "the record itself"}
+inputs_now = cache(identity.inputs)
 
 
 def collect(root=INPUTS, params_root=PARAMS, n_seeds=1):
@@ -221,9 +226,6 @@ def inputs(tmp_path, monkeypatch):
     return shutil.copytree(INPUTS, tmp_path / "inputs")
 
 
-inputs_now = cache(identity.inputs)
-
-
 def origin(notebook, case, seed, variant="improved", upstream=None):
     """The part of a record that says where a result comes from, as if it had been made now."""
     run = {"notebook": notebook, "case": case, "seed": seed, "scale": "smoke", "variant": variant}
@@ -247,10 +249,6 @@ def refusal(*arguments):
         collect(*arguments)
     assert "\n" not in str(caught.value)
     return str(caught.value)
-
-
-MISSING = {2: {"demonstrations": "01"}, 1: {"offline_printed": "02"}}
-MISSING |= {3: {"transfer_improved": "04", "online_improved": "03 (04 for the transfer case)"}}
 
 
 def test_a_missing_stage_or_seed_names_its_file_and_what_to_run(inputs):
@@ -346,10 +344,6 @@ def test_a_record_without_its_origin_is_refused(inputs):
     for left in ({}, {"notebook": "01_demonstrations", "case": 1}):
         path.write_text(json.dumps({"files": record["files"]} | left))
         assert str(path) in refusal(inputs)
-
-
-MIXTURES = {("inputs", name): name for name in ("src/helpers/learning/lstm.py", "torch")}
-MIXTURES |= {("upstream", "case_2/demonstrations"): "seed_0/case_2/demonstrations", ("seed",): "the record itself"}
 
 
 @pytest.mark.parametrize(("entry", "says"), MIXTURES.items())

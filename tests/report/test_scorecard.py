@@ -17,6 +17,24 @@ TWO = ["h-I", "h-II"]
 SMALL = {4: PublishedCase(table=9, expert=(10.0, -2.0), policy=(11.0, -2.5), alpha=(0.6, -0.8))}
 MEASURED = {"expert": 20000, "policy": 2000}
 SPREAD = 3.0  # of the features over trajectories
+JUDGED = [  # what is published, of how many seeds, the interval, and what is said
+    ("policy", 10.0, 20, 10.0, 11.0, "match", "inside 10.00 to 11.00"),  # an end belongs to the interval
+    ("policy", 10.0, 20, 9.0, 10.0, "match", "inside 9.00 to 10.00"),
+    ("policy", 10.0, 20, 10.01, 11.0, "differs", "0.01 below the interval"),
+    ("policy", 10.0, 20, 9.0, 9.6, "differs", "0.4 above the interval"),
+    ("policy", -10.0, 20, -9.6, -9.0, "differs", "0.4 below the interval"),
+    ("policy", 10.0, 20, 7.5, 12.5, "match", "inside 7.50 to 12.50"),  # a quarter to either side still tells
+    ("policy", 10.0, 20, 7.49, 12.51, "cannot tell", "one run scatters by 2.5 to either side of 10.00"),
+    ("policy", -10.0, 20, -12.51, -7.49, "cannot tell", "one run scatters by 2.5 to either side of -10.00"),
+    ("policy", -10.0, 20, -12.5, -7.5, "match", "inside -12.50 to -7.50"),
+    ("policy", 10.0, 20, 12.0, 17.2, "differs", "2 below the interval"),  # outside tells, however wide
+    ("policy", 10.0, 1, np.nan, np.nan, "cannot tell", "one seed"),
+    ("expert", 10.0, 20, 9.0, 9.6, "fitted", "0.4 above the interval"),  # whatever its interval says
+    ("expert", 10.0, 20, 0.0, 20.0, "fitted", "inside 0.00 to 20.00"),
+    ("expert", 10.0, 1, np.nan, np.nan, "fitted", "settings inferred from it"),
+    ("alpha", 10.0, 0, np.nan, np.nan, "cannot tell", "no seed gave it"),
+    ("alpha", 0.5, 2, 0.4, 0.501, "match", "inside 0.400 to 0.501"),
+]
 
 
 def seeds(n_seeds=6):
@@ -39,27 +57,7 @@ def compare(runs, published=SMALL, names=TWO, measured=MEASURED, errors=None):
     return scorecard.comparison(published, runs, scorecard.summary(runs), names, measured, errors)
 
 
-@pytest.mark.parametrize(
-    ("row", "published", "n_seeds", "low", "high", "expected", "reason"),
-    [
-        ("policy", 10.0, 20, 10.0, 11.0, "match", "inside 10.00 to 11.00"),  # an end belongs to the interval
-        ("policy", 10.0, 20, 9.0, 10.0, "match", "inside 9.00 to 10.00"),
-        ("policy", 10.0, 20, 10.01, 11.0, "differs", "0.01 below the interval"),
-        ("policy", 10.0, 20, 9.0, 9.6, "differs", "0.4 above the interval"),
-        ("policy", -10.0, 20, -9.6, -9.0, "differs", "0.4 below the interval"),
-        ("policy", 10.0, 20, 7.5, 12.5, "match", "inside 7.50 to 12.50"),  # a quarter to either side still tells
-        ("policy", 10.0, 20, 7.49, 12.51, "cannot tell", "one run scatters by 2.5 to either side of 10.00"),
-        ("policy", -10.0, 20, -12.51, -7.49, "cannot tell", "one run scatters by 2.5 to either side of -10.00"),
-        ("policy", -10.0, 20, -12.5, -7.5, "match", "inside -12.50 to -7.50"),
-        ("policy", 10.0, 20, 12.0, 17.2, "differs", "2 below the interval"),  # outside tells, however wide
-        ("policy", 10.0, 1, np.nan, np.nan, "cannot tell", "one seed"),
-        ("expert", 10.0, 20, 9.0, 9.6, "fitted", "0.4 above the interval"),  # whatever its interval says
-        ("expert", 10.0, 20, 0.0, 20.0, "fitted", "inside 0.00 to 20.00"),
-        ("expert", 10.0, 1, np.nan, np.nan, "fitted", "settings inferred from it"),
-        ("alpha", 10.0, 0, np.nan, np.nan, "cannot tell", "no seed gave it"),
-        ("alpha", 0.5, 2, 0.4, 0.501, "match", "inside 0.400 to 0.501"),
-    ],
-)
+@pytest.mark.parametrize(("row", "published", "n_seeds", "low", "high", "expected", "reason"), JUDGED)
 def test_the_verdict_and_its_reason(row, published, n_seeds, low, high, expected, reason):
     assert scorecard.verdict(row, published, n_seeds, low, high) == (expected, reason)
 

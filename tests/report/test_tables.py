@@ -29,20 +29,14 @@ def test_table_1_holds_the_conditions_of_the_paper():
     assert "Concentration of reagent ($C_A^*$) control loop" in tables.to_markdown(table)
 
 
-@pytest.mark.parametrize(
-    ("numbers", "style", "text"),
-    [
-        ((16.84, 16.5, 17.01), {}, "16.8 [16.5, 17.0]"),
-        ((0.0123, 0.0098, 0.0151), {}, "0.0123 [0.0098, 0.0151]"),
-        ((-0.8, -1.26, 0.04), {}, "-0.80 [-1.26, 0.04]"),
-        ((0.812, 0.7, 0.95), {"decimals": 1, "unit": " %"}, "0.8 % [0.7, 0.9]"),
-        ((1957.4, 1954.2, 1958.6), {}, "1957 [1954, 1959]"),
-        ((16.84, np.nan, np.nan), {}, "16.8"),  # too few seeds
-        ((300.0, 300.0, 300.0), {"decimals": 0}, "300"),  # no spread
-        ((0.0, 0.0, 0.0), {}, "0"),
-        ((np.nan, np.nan, np.nan), {}, "–"),
-    ],
-)
+SPREADS = [((16.84, 16.5, 17.01), {}, "16.8 [16.5, 17.0]"), ((0.0123, 0.0098, 0.0151), {}, "0.0123 [0.0098, 0.0151]")]
+SPREADS += [((-0.8, -1.26, 0.04), {}, "-0.80 [-1.26, 0.04]"), ((1957.4, 1954.2, 1958.6), {}, "1957 [1954, 1959]")]
+SPREADS += [((0.812, 0.7, 0.95), {"decimals": 1, "unit": " %"}, "0.8 % [0.7, 0.9]"), ((np.nan, np.nan, np.nan), {}, "–")]
+SPREADS += [((16.84, np.nan, np.nan), {}, "16.8")]  # too few seeds
+SPREADS += [((300.0, 300.0, 300.0), {"decimals": 0}, "300"), ((0.0, 0.0, 0.0), {}, "0")]  # no spread
+
+
+@pytest.mark.parametrize(("numbers", "style", "text"), SPREADS)
 def test_spread(numbers, style, text):
     assert tables.spread(dict(zip(("median", "ci_low", "ci_high"), numbers, strict=True)), **style) == text
 

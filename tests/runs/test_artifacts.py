@@ -19,6 +19,22 @@ from helpers.runs.artifacts import ArtifactError, load_stage, save_stage, trajec
 from helpers.runs.scratch import beside
 
 AWKWARD = pd.DataFrame({"number": [0.1, 1 / 3, 1e-300, np.pi * 1e17, -0.0, np.nan], "name": list("abcdef")})
+NAMES = (("C_A", "T"), ("C_A0", "T_E"))
+# A file, what it holds when it is damaged, if it is there at all, and what is said.
+DAMAGED = [("table.csv", "1,g\n", "file has changed since it was written"), ("table.csv", None, "file is missing")]
+NO_RECORDS = ("", '{"files": {"a', "null", "[]", "{}", '{"files": 3}', "\udcff")
+DAMAGED += [("record.json", None, "result is missing"), *(("record.json", text, "result is damaged") for text in NO_RECORDS)]
+BROKEN_TABLES = {
+    "a column is missing": (lambda table: table.drop(columns="u_T_E"), "the column 'u_T_E' is missing"),
+    "a sample is missing": (lambda table: table.drop(index=5), "column 'sample'"),
+    "a sample stands twice": (lambda table: pd.concat([table, table.iloc[[5]]]), "column 'sample'"),
+    "a trajectory is cut": (lambda table: table.iloc[:-1], "column 'sample'"),
+    "no rows": (lambda table: table.iloc[:0], "column 'sample'"),
+    "a hole": (lambda table: table.assign(x_T=table["x_T"].where(table["sample"] != 3)), "finite"),
+    "an infinite input": (lambda table: table.assign(u_T_E=np.inf), "finite"),
+    "a word for a number": (lambda table: table.assign(y_T=["high", *table["y_T"].iloc[1:]]), "y_T"),
+    "a word for a sample": (lambda table: table.assign(sample=["first", *table["sample"].iloc[1:]]), "sample"),
+}
 
 
 def refusal(action, *arguments, **named):
@@ -119,15 +135,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path, below):
     assert str(tmp_path / "file") in refusal(save_stage, tmp_path / "file" / below, {}, {"a.csv": AWKWARD})
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "says"),  # a file, what it holds then, if it is there at all, and what is said
-    [
-        *(("record.json", text, "result is damaged") for text in ("", '{"files": {"a', "null", "{}", '{"files": 3}', "\udcff")),
-        ("record.json", None, "result is missing"),
-        ("table.csv", "1,g\n", "file has changed since it was written"),
-        ("table.csv", None, "file is missing"),
-    ],
-)
+@pytest.mark.parametrize(("name", "text", "says"), DAMAGED)
 def test_a_stage_of_which_a_file_is_damaged_or_gone_is_refused(saved, name, text, says):
     path = saved.folder / name
     path.unlink()
@@ -143,9 +151,6 @@ def test_what_was_never_written_or_is_no_table_is_refused(saved):
     for text in ("", 'a,b\n1\n2,3,4\n"x'):  # empty, ragged
         saved.path("table.csv").write_text(text)
         assert "table.csv: not a table: " in refusal(saved.table, "table.csv")
-
-
-NAMES = (("C_A", "T"), ("C_A0", "T_E"))
 
 
 def recorded(study, dtype=torch.float64):
@@ -165,19 +170,6 @@ def test_trajectories_come_back_to_the_last_bit_from_where_the_header_says(study
     stage = save_stage(tmp_path, {}, {"t.csv": table.sample(frac=1, random_state=0)})  # whatever the order of the rows
     found = trajectories_from_table(stage.table("t.csv"), *NAMES, dtype, stage.path("t.csv"))
     assert all(signal.dtype == dtype and torch.equal(signal, getattr(batch, name)) for name, signal in vars(found).items())
-
-
-BROKEN_TABLES = {
-    "a column is missing": (lambda table: table.drop(columns="u_T_E"), "the column 'u_T_E' is missing"),
-    "a sample is missing": (lambda table: table.drop(index=5), "column 'sample'"),
-    "a sample stands twice": (lambda table: pd.concat([table, table.iloc[[5]]]), "column 'sample'"),
-    "a trajectory is cut": (lambda table: table.iloc[:-1], "column 'sample'"),
-    "no rows": (lambda table: table.iloc[:0], "column 'sample'"),
-    "a hole": (lambda table: table.assign(x_T=table["x_T"].where(table["sample"] != 3)), "finite"),
-    "an infinite input": (lambda table: table.assign(u_T_E=np.inf), "finite"),
-    "a word for a number": (lambda table: table.assign(y_T=["high", *table["y_T"].iloc[1:]]), "y_T"),
-    "a word for a sample": (lambda table: table.assign(sample=["first", *table["sample"].iloc[1:]]), "sample"),
-}
 
 
 @pytest.mark.parametrize(("change", "says"), BROKEN_TABLES.values(), ids=BROKEN_TABLES)

@@ -20,13 +20,20 @@ from helpers.runs.sources import PROJECT, code_behind
 from torture.runs import Place
 
 SLOW = pytest.mark.torture
+SUMMARIES = {"smoke": "\n1 notebook(s) failed; ", "huge": "\nNo notebook failed, what went wrong stands above; "}
+ADDED = ""  # in place of words to replace: a line at the beginning
+WRONG_ARGUMENTS = {  # the notebook, the copy and parameters; those of a notebook by hand are in test_session.py
+    "an unknown case": (["01_demonstrations", "copies/x.ipynb", "-p", "case", "9"], "case_9.yaml"),
+    "a strange digit": (["01_demonstrations", "copies/x.ipynb", "-p", "seed", "²"], "'seed'"),
+    "an unknown notebook": (["06_oracle", "copies/x.ipynb"], "06_oracle.ipynb"),
+    "a notebook elsewhere": (["../notebooks/01_demonstrations", "copies/x.ipynb"], "there is no such notebook"),
+    "a copy among the code": (["05_report", str(PROJECT / "results/../src/x.ipynb")], "'output'"),
+    "results among the code": (["01_demonstrations", "x.ipynb", "-p", "output_root", str(PROJECT / "src")], "'output_root'"),
+}
 
 
 def everything_below(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
-
-
-ADDED = ""  # in place of words to replace: a line at the beginning
 
 
 def change(path, old, new):
@@ -90,16 +97,6 @@ def test_a_notebook_runs_from_any_directory_and_leaves_no_trace_of_the_machine(h
     # Of an executed notebook all text; in its pictures the names would only match by accident.
     text = re.sub(r'"image/png": "[^"]*"', "", Path("copies/01.ipynb").read_text(encoding="utf-8"))
     assert [place for place in (here, PROJECT, Path.home(), "ipykernel") if f"{place}/" in text] == []
-
-
-WRONG_ARGUMENTS = {  # the notebook, the copy and parameters; those of a notebook by hand are in test_session.py
-    "an unknown case": (["01_demonstrations", "copies/x.ipynb", "-p", "case", "9"], "case_9.yaml"),
-    "a strange digit": (["01_demonstrations", "copies/x.ipynb", "-p", "seed", "²"], "'seed'"),
-    "an unknown notebook": (["06_oracle", "copies/x.ipynb"], "06_oracle.ipynb"),
-    "a notebook elsewhere": (["../notebooks/01_demonstrations", "copies/x.ipynb"], "there is no such notebook"),
-    "a copy among the code": (["05_report", str(PROJECT / "results/../src/x.ipynb")], "'output'"),
-    "results among the code": (["01_demonstrations", "x.ipynb", "-p", "output_root", str(PROJECT / "src")], "'output_root'"),
-}
 
 
 @pytest.mark.parametrize(("arguments", "says"), WRONG_ARGUMENTS.values(), ids=WRONG_ARGUMENTS)
@@ -221,20 +218,18 @@ ONE_SEED = {rule: len(results) for rule, results in RESULTS.items()}
 LEARNT = {rule: number for rule, number in ONE_SEED.items() if rule != "report"}
 ONLINE = {rule: number for rule, number in ONE_SEED.items() if rule not in ("demonstrations", "offline")}
 STAGE = "results/smoke/seed_0/case_{}/{}/record.json"
+NEEDED = [
+    ([], 1, ONE_SEED),
+    ([STAGE.format(3, "transfer_printed")], 1, {"demonstrations": 2, "offline": 1, "transfer_alone": 1}),
+    pytest.param([], 2, {rule: 2 * number for rule, number in LEARNT.items()} | {"report": 1}, marks=SLOW),
+    pytest.param([STAGE.format(2, "demonstrations")], 1, {"demonstrations": 1}, marks=SLOW),
+    pytest.param([STAGE.format(2, "online_improved")], 1, {"demonstrations": 1, "offline": 1, "online": 1}, marks=SLOW),
+    pytest.param([STAGE.format(3, "online_improved")], 1, {"demonstrations": 2, "offline": 1, "transfer": 1}, marks=SLOW),
+]
+NAMES = ["all", "transfer alone", "two seeds", "recording", "online", "transfer"]
 
 
-@pytest.mark.parametrize(
-    ("targets", "n_seeds", "jobs"),
-    [
-        ([], 1, ONE_SEED),
-        ([STAGE.format(3, "transfer_printed")], 1, {"demonstrations": 2, "offline": 1, "transfer_alone": 1}),
-        pytest.param([], 2, {rule: 2 * number for rule, number in LEARNT.items()} | {"report": 1}, marks=SLOW),
-        pytest.param([STAGE.format(2, "demonstrations")], 1, {"demonstrations": 1}, marks=SLOW),
-        pytest.param([STAGE.format(2, "online_improved")], 1, {"demonstrations": 1, "offline": 1, "online": 1}, marks=SLOW),
-        pytest.param([STAGE.format(3, "online_improved")], 1, {"demonstrations": 2, "offline": 1, "transfer": 1}, marks=SLOW),
-    ],
-    ids=["all", "transfer alone", "two seeds", "recording", "online", "transfer"],
-)
+@pytest.mark.parametrize(("targets", "n_seeds", "jobs"), NEEDED, ids=NAMES)
 def test_a_run_needs_each_stage_of_each_seed_and_a_stage_alone_only_what_it_reads(plan, targets, n_seeds, jobs):
     assert plan(*targets, seeds=n_seeds) == jobs
 
@@ -268,6 +263,11 @@ EDITS = [
     ("src/helpers/report/report.py", "RUNNERS = (", "RUNNERS = (*(),", {"report": 1}),
     ("src/helpers/report/figures.py", "MUTED = ", "MUTED: str = ", {"report": 1}),
 ]
+RUN_AGAIN = [
+    EDITS[0],
+    pytest.param("src/helpers/learning/algorithm_2.py", "(self.mean)", "(+self.mean)", ONE_SEED, marks=SLOW),
+    pytest.param("reports/template/report.md.jinja", "# The reproduction", "# A reproduction", {"report": 1}, marks=SLOW),
+]
 
 
 def test_a_change_makes_exactly_the_results_stale_that_are_made_from_it(monkeypatch, source):
@@ -286,14 +286,7 @@ def test_a_change_makes_exactly_the_results_stale_that_are_made_from_it(monkeypa
         (source / changed).write_text(text, encoding="utf-8")
 
 
-@pytest.mark.parametrize(
-    ("changed", "old", "new", "jobs"),
-    [
-        EDITS[0],
-        pytest.param("src/helpers/learning/algorithm_2.py", "(self.mean)", "(+self.mean)", ONE_SEED, marks=SLOW),
-        pytest.param("reports/template/report.md.jinja", "# The reproduction", "# A reproduction", {"report": 1}, marks=SLOW),
-    ],
-)
+@pytest.mark.parametrize(("changed", "old", "new", "jobs"), RUN_AGAIN)
 def test_what_is_stale_is_run_again_with_all_that_read_it(finished, source, changed, old, new, jobs):
     before = change(source / changed, old, new)
     assert finished() == jobs
@@ -317,10 +310,7 @@ def test_what_make_bench_wrote_last_goes_into_the_report_and_results_that_were_r
 
 
 @pytest.mark.torture
-@pytest.mark.parametrize(
-    ("scale", "says"),
-    [("smoke", "\n1 notebook(s) failed; "), ("huge", "\nNo notebook failed, what went wrong stands above; ")],
-)
+@pytest.mark.parametrize(("scale", "says"), SUMMARIES.items())
 def test_the_summary_tells_what_was_refused_before_it_ran(plan, source, scale, says):
     """In a parameter file, or in the command."""
     if scale == "smoke":

@@ -19,6 +19,9 @@ NOTEBOOKS = sorted(path.stem for path in (PROJECT / "notebooks").glob("[0-9]*.ip
 OFFLINE, REPORT = "02_offline_irl", "05_report"
 TAUGHT = [name for name in NOTEBOOKS if name[:2] in ("01", "02", "03", "04", "10")]
 OF_ALL_CASES = {REPORT: ("seeds",), "00_inferred_settings": ("seed",), "07_your_own_process": ("seed",), "09_one_policy": ("seed",)}
+SHOWN = {"alpha:C_A-I": "alpha of <i>C</i><sub>A</sub>-I", "rise_time:T": "rise time of T", "C_A0": "<i>C</i><sub>A0</sub>"}
+SHOWN |= {"a < b": "a &lt; b", **{same: same for same in ("params/case_1.yaml", "$C_{A0}^*$", "12:30:00")}}
+TABLE = {"t.csv": pd.DataFrame({"value": [1.0]})}
 
 
 def defaults(notebook):
@@ -55,30 +58,19 @@ def test_the_parameters_cell_names_known_parameters_of_the_right_type(notebook):
     check_parameters(notebook, found)
 
 
-WRONG = [
-    ({"sed": 3}, ["'sed'", "seed"]),
-    ({"rounds": [1, 2]}, ["'rounds'"]),
-    ({"seed": "0/../../x"}, ["'seed'", "a whole number", "'0/../../x'"]),
-    ({"seed": 1.5}, ["'seed'", "a whole number", "1.5"]),
-    ({"seed": -1}, ["'seed'", "0 or more", "-1"]),
-    ({"case": "1/../../x"}, ["'case'", "a whole number"]),
-    ({"case": True}, ["'case'", "a whole number", "True"]),
-    ({"case": 9}, ["case_9.yaml"]),
-    ({"scale": 1}, ["'scale'", "a text", "1"]),
-    *(({"scale": scale}, ["'scale': expected one of", "smoke", f"found '{scale}'"]) for scale in ("large", "smoke/..", "")),
-    *(
-        ({"variant": name}, [f"expected one of improved, printed, a trial of params/trials.yaml, found '{name}'"])
-        for name in ("best", "improved/../../x", "/x", "")
-    ),
-    ({"params_root": "/nowhere"}, ["/nowhere"]),
-]
-OF_OTHERS = [
-    ("01_demonstrations", {"seeds": 3}, ["'seeds'"]),  # for `-p seed 3` it would otherwise run seed 0 without a word
-    ("01_demonstrations", {"variant": "printed"}, ["'variant'"]),
-    (REPORT, {"seed": 1}, ["'seed'"]),
-    (REPORT, {"seeds": 0}, ["'seeds': expected 1 or more, found 0"]),
-    *((name, {"scale": "lesson"}, ["'scale': expected one of paper, smoke, found"]) for name in NOTEBOOKS if name not in TAUGHT),
-]
+WRONG = [({"sed": 3}, ["'sed'", "seed"]), ({"rounds": [1, 2]}, ["'rounds'"]), ({"params_root": "/nowhere"}, ["/nowhere"])]
+WRONG += [({"seed": seed}, ["'seed'", "a whole number", repr(seed)]) for seed in ("0/../../x", 1.5)]
+WRONG += [({"seed": -1}, ["'seed'", "0 or more", "-1"]), ({"scale": 1}, ["'scale'", "a text", "1"])]
+WRONG += [({"case": case}, ["'case'", "a whole number", repr(case)]) for case in ("1/../../x", True)]
+WRONG += [({"case": 9}, ["case_9.yaml"])]
+WRONG += [({"scale": scale}, ["'scale': expected one of", "smoke", f"found '{scale}'"]) for scale in ("large", "smoke/..", "")]
+KNOWN = "expected one of improved, printed, a trial of params/trials.yaml, found"
+WRONG += [({"variant": name}, [f"{KNOWN} '{name}'"]) for name in ("best", "improved/../../x", "/x", "")]
+OF_OTHERS = [("01_demonstrations", {"seeds": 3}, ["'seeds'"])]  # for `-p seed 3` it would otherwise run seed 0 without a word
+OF_OTHERS += [("01_demonstrations", {"variant": "printed"}, ["'variant'"]), (REPORT, {"seed": 1}, ["'seed'"])]
+OF_OTHERS += [(REPORT, {"seeds": 0}, ["'seeds': expected 1 or more, found 0"])]
+NO_LESSON = ({"scale": "lesson"}, ["'scale': expected one of paper, smoke, found"])
+OF_OTHERS += [(name, *NO_LESSON) for name in NOTEBOOKS if name not in TAUGHT]
 
 
 @pytest.mark.parametrize(("notebook", "given", "says"), [*((OFFLINE, *case) for case in WRONG), *OF_OTHERS])
@@ -131,10 +123,6 @@ def test_streams_differ_by_seed_case_and_purpose():
     assert len({first, *others}) == 4
 
 
-SHOWN = {"alpha:C_A-I": "alpha of <i>C</i><sub>A</sub>-I", "rise_time:T": "rise time of T", "C_A0": "<i>C</i><sub>A0</sub>"}
-SHOWN |= {"a < b": "a &lt; b", **{same: same for same in ("params/case_1.yaml", "$C_{A0}^*$", "12:30:00")}}
-
-
 @pytest.mark.parametrize(("label", "shown"), SHOWN.items())
 def test_a_table_is_shown_in_words_and_four_digits(label, shown):
     text = readable(pd.DataFrame({label: [1.23456789, float("nan"), 123456.7]}, index=["first", label, "last"]))
@@ -160,9 +148,6 @@ def test_a_saved_stage_records_where_it_comes_from(tmp_path):
     loaded = opened(seed=4, input_root=str(tmp_path)).load("offline_improved", "02")
     assert loaded.record == record
     assert loaded.table("t.csv").equals(table)  # display options, which a session sets, do not reach the files
-
-
-TABLE = {"t.csv": pd.DataFrame({"value": [1.0]})}
 
 
 def test_the_seconds_of_the_results_of_one_run_add_up_to_its_own(tmp_path):

@@ -10,6 +10,8 @@ import pytest
 from helpers.runs import sources
 
 TELL = "\nimport sys\nprint(*(name for name in sys.modules if name.startswith('helpers.')))"
+LEARNING, REPORT = {"helpers.learning.algorithm_2", "helpers.runs.session"}, {"helpers.report.collection"}
+NOTEBOOKS = [("02_offline_irl", LEARNING), pytest.param("05_report", REPORT, marks=pytest.mark.torture)]
 
 
 def import_statements(notebook):
@@ -23,10 +25,6 @@ def names_behind(notebook):
     """The dotted names of the modules behind a notebook."""
     paths = [path.relative_to(sources.PROJECT / "src").with_suffix("") for path in sources.modules_behind(notebook)]
     return {".".join(path.parts).removesuffix(".__init__") for path in paths}
-
-
-LEARNING, REPORT = {"helpers.learning.algorithm_2", "helpers.runs.session"}, {"helpers.report.collection"}
-NOTEBOOKS = [("02_offline_irl", LEARNING), pytest.param("05_report", REPORT, marks=pytest.mark.torture)]
 
 
 @pytest.mark.parametrize(("notebook", "among"), NOTEBOOKS)

@@ -11,8 +11,15 @@ from helpers.settings.limits import load_limits
 from helpers.settings.paper import load, load_published
 
 DELETE = "delete this key"
+SCALES = [([1.0, 4.0], None, (2.0, 5.0)), ([1.0, 4.0], [0.5, -2.0], (0.5, -2.0)), ([-1.0, 4.0], [1.0, 4.0], (1.0, 4.0))]
 GAINS = ("proportional", "integral", "derivative")
 FILES = ("process.yaml", "demonstrators.yaml", "features.yaml", "learning.yaml", "trials.yaml", "limits.yaml", "published.yaml")
+DAMAGED = {"empty": b"", "a list": b"- 1\n- 2\n", "unclosed bracket": b"beta: {value: 10.0\n", "tab": b"beta:\n\t- 1\n"}
+DAMAGED |= {"unknown tag": b"beta: !!python/object/apply:os.getcwd []\n", "two documents": b"a: 1\n---\nb: 2\n"}
+DAMAGED |= {"unknown alias": b"a: *b\n", "unhashable key": b"{[1, 2]: 3}\n"}
+DAMAGED |= {"binary": bytes(range(256)), "control characters": b"beta: \x00\x01\x02\n"}
+NO_KEYS = {"beta: {value: 9.0, value: 10.0": 'duplicate key "value"', "discount: 1\nbeta: {value: 10.0": 'duplicate key "discount"'}
+NO_KEYS |= {"7: 1\nbeta: {value: 10.0": "key '7'"}
 
 
 @pytest.fixture
@@ -59,10 +66,10 @@ def refusal(folder, case=1):
     return sentence
 
 
-@pytest.mark.parametrize(
-    ("case", "epochs", "iterations", "demonstrator"), [(1, 300, 4, "PID1"), (2, 250, 3, "PID2"), (3, 80, 1, "PID1")]
-)
-def test_the_committed_files_are_as_printed_and_every_leaf_is_listed(root, case, epochs, iterations, demonstrator):
+@pytest.mark.equation("4.1.3b")
+@pytest.mark.equation("4.1.3c")
+@pytest.mark.parametrize(("case", "printed"), [(1, (300, 4, "PID1")), (2, (250, 3, "PID2")), (3, (80, 1, "PID1"))])
+def test_the_committed_files_are_as_printed_and_every_leaf_is_listed(root, case, printed):
     params, limits, published = read_all(root, case)
     found = {(row["file"], row["key"]) for row in params.leaves}
     keys = ("balance.rate_constant", "PID2.integral", "variants.printed.weights.step", "online.headline_beta")
@@ -70,8 +77,10 @@ def test_the_committed_files_are_as_printed_and_every_leaf_is_listed(root, case,
     assert set(zip(files, keys, strict=True)) <= found
     assert len(found) == len(params.leaves)
     assert all(set(row) == {"file", "key", *LEAF_KEYS} and row["status"] in STATUSES for row in params.leaves)
-    offline, online = params.case.offline, params.case.online
-    assert (offline.epochs, offline.iterations, params.case.demonstrator) == (epochs, iterations, demonstrator)
+    process, offline, online = params.process, params.case.offline, params.case.online
+    assert process.drift_state == ((-3.997, -0.446), (-6.092, -1.581))
+    assert (process.drift_input, process.disturbance, process.horizon) == (((0.5, 0.0), (0.0, 0.305)), (0.5, 0.3), 50)
+    assert (offline.epochs, offline.iterations, params.case.demonstrator) == printed
     assert (online.epochs, online.headline_beta) == ((10, 10), 30)
     scale = params.learning.scales["paper"]
     assert (scale.demonstrations, scale.epoch_share) == (EPISODES_PER_EPOCH, 1) == (500, 1)
@@ -84,19 +93,8 @@ def test_the_committed_files_are_as_printed_and_every_leaf_is_listed(root, case,
     assert sum(weight**2 for weight in table.alpha) == pytest.approx(1, abs=3e-3)  # printed with three decimals
 
 
-@pytest.mark.equation("4.1.3b")
-@pytest.mark.equation("4.1.3c")
-def test_the_process_is_as_printed(root):
-    process = load(root, 1).process
-    assert process.drift_state == ((-3.997, -0.446), (-6.092, -1.581))
-    assert (process.drift_input, process.disturbance, process.horizon) == (((0.5, 0.0), (0.0, 0.305)), (0.5, 0.3), 50)
-
-
 @pytest.mark.equation("4.2.1")
-@pytest.mark.parametrize(
-    ("set_point", "error_scale", "expected"),
-    [([1.0, 4.0], None, (2.0, 5.0)), ([1.0, 4.0], [0.5, -2.0], (0.5, -2.0)), ([-1.0, 4.0], [1.0, 4.0], (1.0, 4.0))],
-)
+@pytest.mark.parametrize(("set_point", "error_scale", "expected"), SCALES)
 def test_scale_of_error(folder, set_point, error_scale, expected):
     changes = {"set_point.value": set_point, "steady_state.value": [-1.0, -1.0]}
     edit(folder / "case_1.yaml", changes | ({"error_scale": leaf(error_scale, DEVIATION)} if error_scale else {}))
@@ -185,13 +183,11 @@ LEAF = [  # the same of the parts of a leaf
     *((key, DELETE, f"'{key}'") for key in LEAF_KEYS),
 ]
 
-KEYS = {  # that are deleted, or misspelt
-    "process.yaml": ["sampling_time", "balance.heat_exchange"],
-    "features.yaml": ["beta"],
-    "learning.yaml": ["online", "scales.paper.measured", "variants.improved.weights.step"],
-    "demonstrators.yaml": ["PID1.derivative"],
-    "case_1.yaml": ["offline.epochs"],
-}
+KEYS = [  # that are deleted, or misspelt
+    *(("process.yaml", key) for key in ("sampling_time", "balance.heat_exchange")),
+    *(("learning.yaml", key) for key in ("online", "scales.paper.measured", "variants.improved.weights.step")),
+    *(("features.yaml", "beta"), ("demonstrators.yaml", "PID1.derivative"), ("case_1.yaml", "offline.epochs")),
+]
 
 PARTS = [  # what is no leaf, or no group of them
     *(("process.yaml", "sampling_time", entry, "value, unit, source, status") for entry in (0.04, None, [0.04], "0.04")),
@@ -217,8 +213,8 @@ MISTAKES = [
         for value in values
     ),
     *(("process.yaml", {f"sampling_time.{part}": value}, "'sampling_time'", says) for part, value, says in LEAF),
-    *((file, {key: DELETE}, f"'{key}'", "missing") for file, keys in KEYS.items() for key in keys),
-    *((file, {f"{key}_": leaf(1)}, f"'{key}_'", "unknown") for file, keys in KEYS.items() for key in keys),
+    *((file, {key: DELETE}, f"'{key}'", "missing") for file, key in KEYS),
+    *((file, {f"{key}_": leaf(1)}, f"'{key}_'", "unknown") for file, key in KEYS),
     *((file, {key: entry}, key.split(".")[-1], says) for file, key, entry, says in PARTS),
     ("demonstrators.yaml", {f"PID1.{gain}.value": [1.0, 2.0, 3.0] for gain in GAINS}, "PID1.proportional", "expected 2"),
     ("process.yaml", ONE_INPUT, "'manipulated'", "a PID pairs 2 loops"),
@@ -233,25 +229,12 @@ def test_a_mistake_is_named(folder, file, changes, key, says):
     assert all(part in sentence for part in (file, key, says)), sentence
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "says"),
-    [
-        ("beta: {value: 10.0", "beta: {value: 9.0, value: 10.0", ('"value"', "duplicate")),
-        ("beta:", "discount: 1\nbeta:", ('"discount"', "duplicate")),
-        ("beta:", "7: 1\nbeta:", ("key '7'",)),
-    ],
-)
-def test_a_key_that_stands_twice_or_is_no_word_is_named(folder, old, new, says):
+@pytest.mark.parametrize(("new", "says"), NO_KEYS.items())
+def test_a_key_that_stands_twice_or_is_no_word_is_named(folder, new, says):
     path = folder / "features.yaml"
-    path.write_text(path.read_text().replace(old, new, 1))
+    path.write_text(path.read_text().replace("beta: {value: 10.0", new, 1))
     sentence = refusal(folder)
-    assert all(part in sentence for part in ("features.yaml", *says)), sentence
-
-
-DAMAGED = {"empty": b"", "a list": b"- 1\n- 2\n", "unclosed bracket": b"beta: {value: 10.0\n", "tab": b"beta:\n\t- 1\n"}
-DAMAGED |= {"unknown tag": b"beta: !!python/object/apply:os.getcwd []\n", "two documents": b"a: 1\n---\nb: 2\n"}
-DAMAGED |= {"unknown alias": b"a: *b\n", "unhashable key": b"{[1, 2]: 3}\n"}
-DAMAGED |= {"binary": bytes(range(256)), "control characters": b"beta: \x00\x01\x02\n"}
+    assert all(part in sentence for part in ("features.yaml", says)), sentence
 
 
 @pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)

@@ -49,17 +49,14 @@ def closed(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory, closed):
-    """A small run, what it makes undisturbed and without a network, and how long it takes."""
-    place = Place.copied(tmp_path_factory.mktemp("survival") / "project", targets=SMALL)
-    environment, prefix, _ = closed
-    expected, seconds = undisturbed(place, prefix=prefix, **environment)
-    return place, expected, seconds
+    """A small run, and what it makes undisturbed and without a network."""
+    place, (environment, prefix, _) = Place.copied(tmp_path_factory.mktemp("survival") / "project", targets=SMALL), closed
+    return place, undisturbed(place, prefix=prefix, **environment)[0]
 
 
 @pytest.mark.torture
 def test_nothing_reaches_the_network_while_notebooks_run(small, closed):
-    _, expected, _ = small
-    environment, _, log = closed
+    (_, expected), (environment, _, log) = small, closed
     assert len(expected) == 4
     assert not log.exists(), log.read_text()
     tried = [sys.executable, "-c", "import urllib.request; urllib.request.urlopen('http://192.0.2.1/')"]  # the guard does its work
@@ -74,7 +71,7 @@ def test_a_strike_that_finds_nobody_is_no_kill():
 
 @pytest.mark.torture
 def test_one_seed_that_fails_stops_no_other_and_is_named_once(small, tmp_path):
-    place, expected, _ = small
+    place, expected = small
     targets = tuple(STAGE.format(seed, 2, "offline_improved") for seed in (0, 1))
     broken = replace(Place.copied(tmp_path / "project"), seeds=2, targets=targets)
     shutil.copytree(place.project / "results", broken.project / "results")
@@ -118,8 +115,7 @@ def record(folder):
 
 @pytest.mark.torture
 def test_a_full_disk_and_a_read_only_one_end_in_a_sentence_and_the_run_resumes(small, disk):
-    _, expected, _ = small
-    folder, again = disk
+    (_, expected), (folder, again) = small, disk
     files = expected["seed_0/case_2/demonstrations"][0]
     for options, cause in (("size=200k", "No space left on device"), ("ro,size=20m", "Read-only file system")):
         again(options)

@@ -175,32 +175,24 @@ VALUES = {  # mistakes, by file and key: what the sentence must say, and the val
     },
 }
 
-LEAF = [  # the same of the parts of a leaf
-    *(("unit", value, "'time'") for value in ("s", None)),
-    *(("source", value, "source") for value in ("", 3)),
-    *(("status", value, "reported, inferred, assumed") for value in ("guessed", ["reported"])),
-    ("stauts", "reported", "'stauts'"),
-    *((key, DELETE, f"'{key}'") for key in LEAF_KEYS),
-]
+# The same of the parts of a leaf.
+LEAF = [("unit", "s", "'time'"), ("unit", None, "'time'"), ("source", "", "source"), ("source", 3, "source")]
+LEAF += [("status", status, "reported, inferred, assumed") for status in ("guessed", ["reported"])]
+LEAF += [("stauts", "reported", "'stauts'"), *((key, DELETE, f"'{key}'") for key in LEAF_KEYS)]
 
-KEYS = [  # that are deleted, or misspelt
-    *(("process.yaml", key) for key in ("sampling_time", "balance.heat_exchange")),
-    *(("learning.yaml", key) for key in ("online", "scales.paper.measured", "variants.improved.weights.step")),
-    *(("features.yaml", "beta"), ("demonstrators.yaml", "PID1.derivative"), ("case_1.yaml", "offline.epochs")),
-]
+# Keys that are deleted, or misspelt.
+KEYS = [("process.yaml", "sampling_time"), ("process.yaml", "balance.heat_exchange"), ("demonstrators.yaml", "PID1.derivative")]
+KEYS += [("learning.yaml", key) for key in ("online", "scales.paper.measured", "variants.improved.weights.step")]
+KEYS += [("features.yaml", "beta"), ("case_1.yaml", "offline.epochs")]
 
-PARTS = [  # what is no leaf, or no group of them
-    *(("process.yaml", "sampling_time", entry, "value, unit, source, status") for entry in (0.04, None, [0.04], "0.04")),
-    ("process.yaml", "balance", 3.0, ""),
-    ("learning.yaml", "scales.paper", None, ""),
-    ("demonstrators.yaml", "PID1", "well tuned", ""),
-    *(("case_1.yaml", "error_scale", leaf(scale, DEVIATION), "") for scale in ([0.0, 4.0], [1.0], ["1", 4.0])),
-    ("published.yaml", "case_1", None, ""),
-    *(("published.yaml", "case_1.expert", entry, "case_1.expert") for entry in (DELETE, "21.63", [21.63, "20.68", 4.08])),
-    ("published.yaml", "case_1.table", 0, "case_1.table"),
-    ("published.yaml", "case_1.tabel", 2, "case_1.tabel"),
-    ("published.yaml", "case_1.alpha", [0.137, 0.652, -0.067, -0.630, -0.194], ""),  # a weight too few
-]
+# What is no leaf, or no group of them; of the last a weight is missing.
+PARTS = [("process.yaml", "sampling_time", entry, "value, unit, source, status") for entry in (0.04, None, [0.04], "0.04")]
+PARTS += [("process.yaml", "balance", 3.0, ""), ("learning.yaml", "scales.paper", None, "")]
+PARTS += [("case_1.yaml", "error_scale", leaf(scale, DEVIATION), "") for scale in ([0.0, 4.0], [1.0], ["1", 4.0])]
+PARTS += [("published.yaml", "case_1.expert", entry, "case_1.expert") for entry in (DELETE, "21.63", [21.63, "20.68", 4.08])]
+PARTS += [("published.yaml", "case_1.table", 0, "case_1.table"), ("published.yaml", "case_1.tabel", 2, "case_1.tabel")]
+PARTS += [("demonstrators.yaml", "PID1", "well tuned", ""), ("published.yaml", "case_1", None, "")]
+PARTS += [("published.yaml", "case_1.alpha", [0.137, 0.652, -0.067, -0.630, -0.194], "")]
 
 ONE_INPUT = {f"{name}.value": ["a"] for name in ("manipulated", "manipulated_description")}
 ONE_INPUT |= {"input_low.value": [-1.0], "input_high.value": [1.0], "drift_input.value": [[1.0], [1.0]]}

@@ -97,7 +97,6 @@ def opened(browser, lab, notebook):
 
 
 def picture(page, name):
-    """A picture of the whole notebook."""
     PICTURES.mkdir(parents=True, exist_ok=True)
     page.set_viewport_size({"width": WIDTH, "height": min(TALLEST, page.evaluate(f"{PANEL}.scrollHeight") + 150)})
     page.evaluate(f"{PANEL}.scrollTo(0, 0)")

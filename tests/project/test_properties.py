@@ -209,7 +209,6 @@ def test_mutated_artifacts(stage_of, monkeypatch, data, name, sealed):
 
 @pytest.fixture(scope="module")
 def recorded(study):
-    """A table of demonstrations."""
     case = study(1)
     return trajectories_to_table(rollout(case.process, case.pid, case.task, 3, stream(0, "properties")), *NAMES, 0.04)
 

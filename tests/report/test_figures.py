@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 import torch
 from matplotlib.collections import PolyCollection
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from helpers.plant.task import Trajectories
@@ -23,18 +22,18 @@ WORDS = {"C_A": "concentration of reagent", "T": "reactor temperature", "T_E": "
 N_STEPS = 40
 
 
-def response(n_loops: int = 2) -> pd.DataFrame:
+def response(n_loops=2):
     generator = torch.Generator().manual_seed(0)
     signals = zip(*(torch.randn(2, n, 7, n_loops, generator=generator) for n in (N_STEPS + 1, N_STEPS)), strict=True)
     return response_table(*(Trajectories(x, x + 1, u, 2 * u) for x, u in signals), OUTPUTS[:n_loops], INPUTS[:n_loops])
 
 
-def draw(n_loops: int = 2, table: pd.DataFrame | None = None) -> Figure:
+def draw(n_loops=2, table=None):
     table = response(n_loops) if table is None else table
     return figures.control_figure(table, OUTPUTS[:n_loops], INPUTS[:n_loops], SET_POINTS[:n_loops], WORDS)
 
 
-def history(n_epochs: int = 60) -> pd.DataFrame:
+def history(n_epochs=60):
     epochs = np.arange(1, n_epochs + 1)
     frame = pd.DataFrame({"iteration": epochs, "epochs": epochs, "mean_return": np.sqrt(epochs), "feature_gap": 1 / epochs})
     for index, feature in enumerate(("C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III")):
@@ -42,19 +41,14 @@ def history(n_epochs: int = 60) -> pd.DataFrame:
     return frame
 
 
-def rows_of(table: pd.DataFrame, controller: str, variable: str) -> pd.DataFrame:
+def rows_of(table, controller, variable):
     return table.query("controller == @controller and variable == @variable")
 
 
-def texts(figure: Figure) -> str:
+def texts(figure):
     """All text of a figure, line breaks as spaces."""
     figure.draw_without_rendering()
     return " ".join(text.get_text() for text in figure.findobj(matplotlib.text.Text)).replace("\n", " ")
-
-
-def curve(line: Line2D) -> np.ndarray:
-    """The points of a line, shape (n, 2)."""
-    return np.asarray(line.get_xydata(), dtype=float)
 
 
 def test_response_table_holds_mean_and_deviation_of_true_states_and_applied_inputs():
@@ -86,7 +80,7 @@ def test_control_figure_draws_every_response_as_given_and_names_it(n_loops):
             for controller in ("agent", "expert"):
                 expected = rows_of(table, controller, variable).query("time_index >= @start")
                 label = f"{expected['kind'].iloc[0]}, {controller}"
-                points = curve(lines[label])
+                points = lines[label].get_xydata()
                 np.testing.assert_array_equal(points[: len(expected)], expected[["time_index", "mean"]])
                 if start:  # a band would fill the zoom
                     assert bands == {}
@@ -99,7 +93,7 @@ def test_control_figure_draws_every_response_as_given_and_names_it(n_loops):
                     assert len(points) == N_STEPS + 1
                     assert lines[label].get_drawstyle() == "steps-post"
                 else:
-                    assert curve(lines["set point"]).tolist() == [[start, SET_POINTS[loop]], [N_STEPS, SET_POINTS[loop]]]
+                    assert lines["set point"].get_xydata().tolist() == [[start, SET_POINTS[loop]], [N_STEPS, SET_POINTS[loop]]]
 
 
 def test_control_figure_has_the_colours_of_the_paper_and_styles_that_differ():
@@ -115,7 +109,7 @@ def test_control_figure_has_the_colours_of_the_paper_and_styles_that_differ():
         assert {line.get_color() for line in axes.lines} <= {colour for colour, _ in look.values()}
 
 
-def budget_figure() -> Figure:
+def budget_figure():
     rows = [(s, c, n, c + s + n / 500) for s in range(3) for c in (1, 2) for n in (500, 20, 100)]
     budget = pd.DataFrame(rows, columns=["seed", "case", "episodes_per_epoch", "objective"])
     levels = {"PID": 1.5, "offline policy": 1.2, "minimum variance on y": 5.0}
@@ -164,7 +158,7 @@ def test_a_response_without_a_variable_is_refused():
         draw(2, response().query("controller == 'expert' or variable != 'T_E'"))
 
 
-def several(table: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
+def several(table, columns):
     """The table for four seeds, its columns shifted by 0, 1, 2 and 10."""
     shifts = enumerate((0.0, 1.0, 2.0, 10.0))
     frames = [table.assign(seed=seed, **{name: table[name] + shift for name in columns}) for seed, shift in shifts]
@@ -177,7 +171,7 @@ def test_several_seeds_are_thin_lines_about_their_median_and_an_input_is_held_un
     expected = rows_of(table, "agent", "T")
     panel, of_input = ({axes.get_label(): axes for axes in figure.axes}[name] for name in ("B T", "T_E"))
     (line,) = [line for line in panel.lines if line.get_label() == "controlled, agent"]
-    np.testing.assert_allclose(curve(line)[:, 1], expected["mean"] + 1.5)
+    np.testing.assert_allclose(line.get_ydata(), expected["mean"] + 1.5)
     summary = figures.drawn_summary(figure).query("panel == 'B T' and artist == @figures.SINGLE")
     assert len(summary) == 2 * 4  # of expert and agent
     assert np.isin(np.round(expected["mean"].max() + np.array([0.0, 1, 2, 10]), 9), summary["maximum"].round(9)).all()
@@ -196,8 +190,8 @@ def test_learning_curves_of_several_seeds_show_each_and_their_median():
     table = history()
     figure = figures.learning_curves(several(table, ["mean_return", "alpha:T-I"]), {40: "policy kept"})
     returns, _, weights = figure.axes
-    np.testing.assert_allclose(curve(returns.lines[0])[:, 1], table["mean_return"] + 1.5)
-    np.testing.assert_allclose(curve(weights.lines[1])[:, 1], table["alpha:T-I"] + 1.5)
+    np.testing.assert_allclose(returns.lines[0].get_ydata(), table["mean_return"] + 1.5)
+    np.testing.assert_allclose(weights.lines[1].get_ydata(), table["alpha:T-I"] + 1.5)
     assert [len(axes.collections) for axes in figure.axes] == [1, 1, 6]
     assert all(len(collection.get_paths()) == 4 for axes in figure.axes for collection in axes.collections)
     assert "each of 4 seeds" in texts(figure)
@@ -206,7 +200,7 @@ def test_learning_curves_of_several_seeds_show_each_and_their_median():
 def test_the_budget_curve_shows_median_seeds_and_references():
     figure = budget_figure()
     for case, axes in enumerate(figure.axes, 1):
-        assert curve(axes.lines[0]).tolist() == pytest.approx(np.array([[n, case + 1 + n / 500] for n in (20, 100, 500)]))
+        assert axes.lines[0].get_xydata().tolist() == pytest.approx(np.array([[n, case + 1 + n / 500] for n in (20, 100, 500)]))
         assert [line.get_ydata()[0] for line in axes.lines[1:]] == [1.5, 1.2, 5.0]
         assert (len(axes.collections[0].get_paths()), axes.get_xscale()) == (3, "log")
     shown = texts(figure)
@@ -226,7 +220,7 @@ def test_learning_curves_draw_return_gap_and_every_weight():
     for line, column in zip(weights.lines, (name for name in table if name.startswith("alpha:")), strict=False):
         np.testing.assert_array_equal(line.get_ydata(), table[column])
     assert [[*line.get_ydata()] for line in (returns.lines[1], gap.lines[1])] == [[3.0, 3.0], [0.037, 0.037]]
-    assert all(curve(axes.lines[-1])[:, 0].tolist() == [40, 40] for axes in figure.axes)
+    assert all([*axes.lines[-1].get_xdata()] == [40, 40] for axes in figure.axes)
     shown = texts(figure)
     assert all(part in shown for part in (*labels, "PID", "the paper", "policy kept", "epoch", "discounted return"))
     names = [f"{loop}-{kind}" for kind in ("I", "II", "III") for loop in OUTPUTS]

@@ -77,7 +77,6 @@ def test_the_report_opens_without_a_network_and_no_markup_shows_through(page):
 
 @pytest.fixture(scope="module")
 def targets(page):
-    """Where the links of the page lead."""
     return {element["href"] for element in page("a", href=True)}
 
 
@@ -173,8 +172,8 @@ def test_every_figure_and_table_of_the_paper_has_its_files_in_place_of_older_one
     assert not (written / "tables/table_9.csv").exists()  # of an older report, of which only what is not its own stays
     assert (written / "notes.txt").read_text() == (written / "notebooks/05_report.ipynb").read_text() == "old"
     assert [path.name for path in written.iterdir() if path.name.startswith(".")] == []
-    for number, ending in product((1, 2, 3, 4), ("csv", "md")):
-        assert (written / "tables" / f"table_{number}.{ending}").stat().st_size > 100
+    tables = [written / f"tables/table_{number}.{ending}" for number, ending in product((1, 2, 3, 4), ("csv", "md"))]
+    assert all(path.stat().st_size > 100 for path in tables)
     for number in (2, 3, 4):
         table = pd.read_csv(written / f"tables/table_{number}.csv")
         assert table["source"].tolist() == ["published", "reproduced", "verdict"] * 3

@@ -38,7 +38,6 @@ BROKEN_TABLES = {
 
 
 def refusal(action, *arguments, **named):
-    """The sentence with which an action is refused."""
     with pytest.raises(ArtifactError) as caught:
         action(*arguments, **named)
     assert "\n" not in str(caught.value)

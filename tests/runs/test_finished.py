@@ -23,7 +23,6 @@ def run(folder, variant="improved", dtype="float64"):
 
 
 def n_kept(folder):
-    """How many trainings a run has finished."""
     return len(list(folder.rglob("*.pt")))
 
 

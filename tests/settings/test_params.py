@@ -45,7 +45,6 @@ def edit(path, changes):
 
 
 def leaf(value, unit="-"):
-    """An entry of a parameter file."""
     return {"value": value, "unit": unit, "source": "a test", "status": "assumed"}
 
 

@@ -134,6 +134,12 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path, below):
     assert str(tmp_path / "file") in refusal(save_stage, tmp_path / "file" / below, {}, {"a.csv": AWKWARD})
 
 
+@pytest.mark.parametrize("files", ['{"table.csv": 3}', '{"../table.csv": "a hash"}'])
+def test_a_record_of_what_are_no_file_names_and_hashes_is_refused(saved, files):
+    (saved.folder / "record.json").write_text(f'{{"files": {files}}}')
+    assert "record.json: key 'files': expected file names and their hashes" in refusal(load_stage, saved.folder, "notebook 01")
+
+
 @pytest.mark.parametrize(("name", "text", "says"), DAMAGED)
 def test_a_stage_of_which_a_file_is_damaged_or_gone_is_refused(saved, name, text, says):
     path = saved.folder / name

@@ -27,10 +27,8 @@ SETTINGS = {  # every cell is drawn, not only those in view; no question about n
 }
 WIDTH, TALLEST = 1200, 16000  # pixels
 PATIENCE = 300.0  # seconds for the cells of a notebook
-RUN = "() => window.jupyterapp.commands.execute('notebook:run-all-cells')"
 CELLS = "() => window.jupyterapp.shell.currentWidget.content.model.sharedModel.toJSON().cells"
-HEIGHT = "() => document.querySelector('.jp-WindowedPanel-outer').scrollHeight"
-TO_TOP = "() => document.querySelector('.jp-WindowedPanel-outer').scrollTo(0, 0)"
+PANEL = "() => document.querySelector('.jp-WindowedPanel-outer')"
 
 pytestmark = [
     pytest.mark.browser,
@@ -77,7 +75,7 @@ def browser():
 
 @contextmanager
 def opened(browser, lab, notebook):
-    """A page with a notebook, ready to run."""
+    """A page with a notebook of which all cells were run."""
     page = browser.new_page(viewport={"width": WIDTH, "height": 900})
     page.set_default_timeout(1000 * PATIENCE)
     for _ in range(60):
@@ -88,9 +86,10 @@ def opened(browser, lab, notebook):
             time.sleep(1)
     page.wait_for_function("() => window.jupyterapp?.shell.currentWidget?.content?.model?.cells?.length > 0")
     page.evaluate("async () => { await window.jupyterapp.shell.currentWidget.sessionContext.ready }")
-    page.evaluate("() => window.jupyterapp.commands.execute('notebook:clear-all-cell-outputs')")
     page.evaluate("() => window.jupyterapp.shell.collapseLeft()")
     try:
+        for what in ("clear-all-cell-outputs", "run-all-cells"):
+            page.evaluate(f"() => window.jupyterapp.commands.execute('notebook:{what}')")
         yield page
     finally:
         page.evaluate("() => window.jupyterapp.serviceManager.sessions.shutdownAll()")
@@ -98,10 +97,9 @@ def opened(browser, lab, notebook):
 
 
 def picture(page, name):
-    """A picture of the whole notebook."""
     PICTURES.mkdir(parents=True, exist_ok=True)
-    page.set_viewport_size({"width": WIDTH, "height": min(TALLEST, page.evaluate(HEIGHT) + 150)})
-    page.evaluate(TO_TOP)
+    page.set_viewport_size({"width": WIDTH, "height": min(TALLEST, page.evaluate(f"{PANEL}.scrollHeight") + 150)})
+    page.evaluate(f"{PANEL}.scrollTo(0, 0)")
     page.wait_for_timeout(1500)  # formulas are set
     page.screenshot(path=PICTURES / f"{name}.png")
 
@@ -109,7 +107,6 @@ def picture(page, name):
 @pytest.mark.parametrize("notebook", NOTEBOOKS)
 def test_a_notebook_runs_in_the_browser_without_an_error(lab, browser, notebook):
     with opened(browser, lab, notebook) as page:
-        page.evaluate(RUN)
         cells = [cell for cell in page.evaluate(CELLS) if cell["cell_type"] == "code"]
         picture(page, notebook)
         assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
@@ -119,13 +116,9 @@ def test_a_notebook_runs_in_the_browser_without_an_error(lab, browser, notebook)
 
 def test_a_notebooks_links_open_the_code_the_next_notebook_and_the_full_run(lab, browser):
     with opened(browser, lab, "01_demonstrations") as page:
-        page.evaluate(RUN)
         tab = page.evaluate("() => window.jupyterapp.shell.currentWidget.id")
-        for words, title in (
-            ("02 Offline", "02_offline_irl.ipynb"),
-            ("rollout.py", "rollout.py"),
-            ("reports/reference/notebooks/01_demonstrations_case_1.ipynb", "01_demonstrations_case_1.ipynb"),
-        ):
+        full = "reports/reference/notebooks/01_demonstrations_case_1.ipynb"
+        for words, title in (("02 Offline", "02_offline_irl.ipynb"), ("rollout.py", "rollout.py"), (full, full.rpartition("/")[2])):
             page.evaluate("tab => window.jupyterapp.shell.activateById(tab)", tab)
             page.get_by_role("link", name=words).first.click()
             page.locator(".lm-TabBar-tabLabel", has_text=re.compile(f"^{re.escape(title)}$")).first.wait_for()
@@ -133,7 +126,6 @@ def test_a_notebooks_links_open_the_code_the_next_notebook_and_the_full_run(lab,
 
 def test_a_slider_draws_the_figure_anew(lab, browser):
     with opened(browser, lab, "10_sliders") as page:
-        page.evaluate(RUN)
         figure = page.locator(".jupyter-widgets img").first
         before = figure.get_attribute("src")
         page.locator(".jupyter-widgets .noUi-handle").first.press("ArrowRight")

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import patch
 from xml.etree import ElementTree as ET
 
 import nbformat
@@ -19,13 +20,18 @@ from helpers.runs.sources import PROJECT
 NOTEBOOKS = {path.stem: path for path in sorted((PROJECT / "notebooks").glob("*.ipynb"))}
 LONGEST = 80  # lines of code, without blank lines and comments
 MACHINE = re.compile(r"(?<![\w.])/(home|root|tmp|work|Users|private|var)/|[A-Z]:\\\\|site-packages|ipykernel_\d")
+LINK = re.compile(r"\[([^\]]+)\]\((?!https?:)([^)#]+)\)")
+REFUSED = {
+    "stripped": (lambda code: [cell.update(execution_count=None, outputs=[]) for cell in code], "not every code cell was executed"),
+    "outputs only": (lambda code: [cell.update(outputs=[]) for cell in code], "fewer than"),
+    "in another order": (lambda code: code[3].update(execution_count=5), "in order"),
+}
 
 _specification = importlib.util.spec_from_file_location("notebook_guard", PROJECT / "notebooks/conftest.py")
 guard = importlib.util.module_from_spec(_specification)
-environment_before = dict(os.environ)
-_specification.loader.exec_module(guard)
-os.environ.clear()  # the guard sets up the environment of the kernels; here it is only examined
-os.environ.update(environment_before)
+with patch.dict(os.environ):  # the guard sets up the environment of the kernels; here it is only examined
+    _specification.loader.exec_module(guard)
+OUTPUT, LAYOUT = guard.Output, guard.Layout
 
 
 @pytest.fixture(params=NOTEBOOKS)
@@ -39,11 +45,10 @@ def code_of(notebook):
 
 def test_a_notebook_tells_a_story_defines_nothing_and_was_executed_whole(notebook):
     nbformat.validate(notebook)
-    first = notebook.cells[0]
-    assert first.cell_type == "markdown"
-    assert first.source.startswith("# ")
-    assert sum(cell.cell_type == "markdown" for cell in notebook.cells) >= 3
-    cells = code_of(notebook)
+    told, cells = [cell.source for cell in notebook.cells if cell.cell_type == "markdown"], code_of(notebook)
+    assert notebook.cells[0].source == told[0]
+    assert told[0].startswith("# ")
+    assert len(told) >= 3
     assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
     code = [cell.source for cell in cells]
     lines = [line for source in code for line in source.splitlines() if line.strip() and not line.strip().startswith("#")]
@@ -86,42 +91,24 @@ def test_the_committed_lesson_tells_the_papers_story():
         assert 0.97 * best < min(online, online_on_y)
 
 
-LINK = re.compile(r"\[([^\]]+)\]\((?!https?:)([^)#]+)\)")
-
-
 def test_every_link_of_a_notebook_leads_somewhere(notebook):
     texts = [cell.source for cell in notebook.cells if cell.cell_type == "markdown"]
     if 'scale = "lesson"' in code_of(notebook)[0].source:  # of the others some were not part of the last published run
         texts += [output.data.get("text/markdown", "") for cell in code_of(notebook) for output in cell.outputs]
-    for _, target in (found for text in texts for found in LINK.findall(text)):
-        assert (PROJECT / "notebooks" / target).exists(), target
+    targets = [target for text in texts for _, target in LINK.findall(text)]
+    assert [target for target in targets if not (PROJECT / "notebooks" / target).exists()] == []
 
 
-# How outputs are compared --------------------------------------------------------------------------------------------
+# Numbers may be 2e-6 off, not 1e-3; of the end of a search words and layout are compared.
+SAME = {OUTPUT: [("gap 12.3456", "gap   12.3456\n"), ("gap 286.4421", "gap 286.4426"), ("1e-05", "0.00001"), ("0", "1e-12")]}
+SAME |= {LAYOUT: [("loss 12.3456  yes", "loss 9.1  no"), ("loss nan", "loss 1.5")]}
+OTHER = {OUTPUT: [("gap 286.4421", "gap 286.7285"), ("gap 1", "loss 1"), ("1 2 3", "1 2"), ("1 2", "2 1"), ("nan", "1.0")]}
+OTHER |= {LAYOUT: [("loss 12.3456", "gap 12.3456"), ("loss 1 2 3", "loss 1 2")]}
+OTHER[OUTPUT] += [("C_A0", "C_A1")]
+COMPARED = [(kind, *pair, found is SAME) for found in (SAME, OTHER) for kind, pairs in found.items() for pair in pairs]
 
 
-OUTPUT, LAYOUT = guard.Output, guard.Layout
-
-
-@pytest.mark.parametrize(
-    ("kind", "stored", "found", "same"),
-    [
-        (OUTPUT, "gap 12.3456", "gap   12.3456\n", True),
-        (OUTPUT, "gap 286.4421", "gap 286.4426", True),  # 2e-6 off
-        (OUTPUT, "gap 286.4421", "gap 286.7285", False),  # 1e-3 off
-        (OUTPUT, "1e-05", "0.00001", True),
-        (OUTPUT, "0", "1e-12", True),
-        (OUTPUT, "gap 1", "loss 1", False),
-        (OUTPUT, "1 2 3", "1 2", False),
-        (OUTPUT, "1 2", "2 1", False),
-        (OUTPUT, "nan", "1.0", False),
-        (OUTPUT, "C_A0", "C_A1", False),
-        (LAYOUT, "loss 12.3456  yes", "loss 9.1  no", True),  # of the end of a search words and layout are compared
-        (LAYOUT, "loss 12.3456", "gap 12.3456", False),
-        (LAYOUT, "loss 1 2 3", "loss 1 2", False),
-        (LAYOUT, "loss nan", "loss 1.5", True),
-    ],
-)
+@pytest.mark.parametrize(("kind", "stored", "found", "same"), COMPARED)
 def test_words_are_compared_exactly_and_numbers_within_the_tolerance(kind, stored, found, same):
     assert (kind(stored) == kind(found)) is same
     assert (kind(stored) != found) is not same
@@ -136,54 +123,47 @@ def test_only_the_notebook_of_searches_has_cells_of_which_the_numbers_are_not_co
         assert any("never worse than where it began" in cell.source for cell in code_of(notebook))
 
 
-# Proof that the tests can fail ---------------------------------------------------------------------------------------
-
-
 class Copy:
-    """A copy of a notebook, to change, with its guard beside it; results go beside it too."""
+    """A copy of a notebook, to change, with its guard beside it; results go beside it too. Proof that the tests can fail."""
 
     def __init__(self, name, folder):
         shutil.copy(PROJECT / "notebooks/conftest.py", folder)
         self.path = Path(folder) / f"{name}.ipynb"
-        self.content = json.loads(NOTEBOOKS[name].read_text(encoding="utf-8"))
-        self.code = [cell for cell in self.content["cells"] if cell["cell_type"] == "code"]
+        self.content = nbformat.read(NOTEBOOKS[name], as_version=4)
+        self.code = code_of(self.content)
         self.replace('output_root = ""', f"output_root = {str(folder)!r}")
 
     def replace(self, old, new):
         """Change a line of the parameters cell."""
-        source = "".join(self.code[0]["source"])
-        assert old in source
-        self.code[0]["source"] = source.replace(old, new)
+        assert old in self.code[0].source
+        self.code[0].source = self.code[0].source.replace(old, new)
 
     def cell(self, words):
         """The number and the content of the cell whose code holds these words."""
-        (found,) = [(number, cell) for number, cell in enumerate(self.code) if words in "".join(cell["source"])]
+        (found,) = [(number, cell) for number, cell in enumerate(self.code) if words in cell.source]
         return found
 
     def shown(self, words, line):
         """Let a cell change what it shows by a line of code."""
         number, cell = self.cell(words)
-        source = "".join(cell["source"])
-        last = ast.parse(source).body[-1].lineno - 1
-        before, expression = source.splitlines()[:last], source.splitlines()[last:]
-        cell["source"] = "\n".join([*before, "shown = (", *expression, ")", line, "shown"])
+        lines, last = cell.source.splitlines(), ast.parse(cell.source).body[-1].lineno - 1
+        cell.source = "\n".join([*lines[:last], "shown = (", *lines[last:], ")", line, "shown"])
         return number
 
     def scale_stored(self, words, factor):
         """Multiply the last number with a fraction in the stored output of a cell, in text and HTML."""
         number, cell = self.cell(words)
-        (output,) = cell["outputs"]
+        (output,) = cell.outputs
         for kind in ("text/plain", "text/html"):
-            text = "".join(output["data"][kind])
-            last = list(re.finditer(r"-?\d+\.\d+", text))[-1]
-            changed = float(last.group()) * factor
-            assert changed != float(last.group())
-            output["data"][kind] = text[: last.start()] + f"{changed:.9g}" + text[last.end() :]
+            last = re.findall(r"-?\d+\.\d+", output.data[kind])[-1]
+            assert float(last) != 0
+            before, _, after = output.data[kind].rpartition(last)
+            output.data[kind] = f"{before}{float(last) * factor:.9g}{after}"
         return number
 
     def run(self):
         """Exit status of nbval, the numbers of the cells that failed, and what it said."""
-        self.path.write_text(json.dumps(self.content), encoding="utf-8")
+        nbformat.write(self.content, self.path)
         folder = self.path.parent
         options = ["-p", "helpers.runs.quick_start", "-p", "no:cacheprovider", "--rootdir", folder]
         options += ["--junitxml", folder / "result.xml", "--nbval", self.path]
@@ -199,12 +179,9 @@ def test_changed_numbers_fail_and_changed_style_and_last_digits_pass(tmp_path):
     copy = Copy("10_sliders", tmp_path)
     wrong = copy.scale_stored("places = {", 1 + 1e-3)
     copy.scale_stored("target = ", 1 + 2e-6)
-    copy.shown(
-        "elsewhere(session, target)", "_ = [line.set(color='black', linewidth=4) for axis in shown.axes for line in axis.lines]"
-    )
-    plotted = copy.shown(
-        'observation noise × 3"], ', "shown.axes[0].lines[0].set_ydata(shown.axes[0].lines[0].get_ydata() * 1.001)"
-    )
+    copy.shown("elsewhere(session, target)", "_ = [line.set(color='k', linewidth=4) for axis in shown.axes for line in axis.lines]")
+    louder = "shown.axes[0].lines[0].set_ydata(shown.axes[0].lines[0].get_ydata() * 1.001)"
+    plotted = copy.shown('observation noise × 3"], ', louder)
     status, failed, said = copy.run()
     assert status == 1, said
     assert failed == [wrong, plotted], said
@@ -212,25 +189,17 @@ def test_changed_numbers_fail_and_changed_style_and_last_digits_pass(tmp_path):
 
 @pytest.mark.torture
 def test_another_learning_rate_fails(tmp_path):
-    params = shutil.copytree(PROJECT / "params", tmp_path / "params")
-    text = (params / "learning.yaml").read_text(encoding="utf-8")
-    changed = text.replace("learning_rate_start: {value: 1.0e-2", "learning_rate_start: {value: 0.9e-2", 1)
-    assert changed != text
-    (params / "learning.yaml").write_text(changed, encoding="utf-8")
+    path = shutil.copytree(PROJECT / "params", tmp_path / "params") / "learning.yaml"
+    text, rate = path.read_text(encoding="utf-8"), "learning_rate_start: {value: 1.0e-2"
+    assert rate in text
+    path.write_text(text.replace(rate, "learning_rate_start: {value: 0.9e-2", 1), encoding="utf-8")
     copy = Copy("02_offline_irl", tmp_path)
-    copy.replace('params_root = ""', f"params_root = {str(params)!r}")
+    copy.replace('params_root = ""', f"params_root = {str(path.parent)!r}")
     learning, _ = copy.cell("algorithm_1(learner")
     status, failed, said = copy.run()
     assert status == 1, said
     assert failed[0] == learning, said
     assert len(failed) >= 5
-
-
-REFUSED = {
-    "stripped": (lambda code: [cell.update(execution_count=None, outputs=[]) for cell in code], "not every code cell was executed"),
-    "outputs only": (lambda code: [cell.update(outputs=[]) for cell in code], "fewer than"),
-    "in another order": (lambda code: code[3].update(execution_count=5), "in order"),
-}
 
 
 @pytest.mark.parametrize(("change", "says"), REFUSED.values(), ids=REFUSED)
@@ -243,6 +212,6 @@ def test_a_notebook_without_outputs_or_run_in_another_order_fails_instead_of_pas
         assert status not in (0, 5)
         assert says in said
     else:
-        copy.path.write_text(json.dumps(copy.content), encoding="utf-8")
+        nbformat.write(copy.content, copy.path)
         with pytest.raises(pytest.UsageError, match=says):
             guard.check_executed(copy.path)

@@ -46,11 +46,9 @@ def test_rates_and_ratios_follow_from_the_median_and_the_bound_of_as_many_thread
     }
     frame = outcome.table(timings, {(10, 5): 3.0})
     assert list(frame.columns[:6]) == FIRST_COLUMNS
-    assert frame["steps_per_s"].tolist() == [50, 25, 25, 10]
-    assert frame["ratio_to_bound"].tolist() == [1, 0.5, 0.5, 0.2]
+    assert [frame[name].tolist() for name in FIRST_COLUMNS[4:]] == [[50, 25, 25, 10], [1, 0.5, 0.5, 0.2]]
     assert frame.loc[0, ["seconds", "seconds_min", "seconds_max", "rounds"]].tolist() == [2, 1, 9, 3]
-    assert frame["peak_mb"].tolist()[2:] == [3, 3]
-    assert frame["peak_mb"][:2].isna().all()
+    assert frame["peak_mb"].fillna(0).tolist() == [0, 0, 3, 3]
 
 
 def test_every_round_meets_every_subject_once_after_a_warm_up_and_a_busy_machine_ends_them_early(monkeypatch):
@@ -72,12 +70,11 @@ def test_exponents_of_time_and_memory_are_fitted_along_both_axes():
     assert fits["exponent"].tolist() == pytest.approx([1, 0.5, 2, 1])  # seconds and memory in K, then in T
     assert fits["factor"].tolist() == pytest.approx([16, 4, 20, 20**0.5])
     figure = outcome.scaling_figure(scaled, fits, 20, 4)
+    outcome.plt.close(figure)
     legends = [text.get_text() for axis in figure.axes for text in axis.get_legend().get_texts()]
     assert legends == ["slope 1.00", "slope 2.00", "slope 0.50", "slope 1.00"]
     assert all(axis.get_xscale() == axis.get_yscale() == "log" for axis in figure.axes)
-    outcome.plt.close(figure)
-    assert np.isnan(outcome.fitted_exponent([5, 5], [1.0, 2.0])).all()
-    assert np.isnan(outcome.fitted_exponent([5, 6], [0.0, 2.0])).all()
+    assert np.isnan([outcome.fitted_exponent([5, 5], [1.0, 2.0]), outcome.fitted_exponent([5, 6], [0.0, 2.0])]).all()
 
 
 def shaken(workload, K, T, dtype, credit="reward_to_go"):
@@ -147,15 +144,14 @@ def test_the_environment_is_the_process_with_its_reward(workload, signal):
     env.reset(seed=3)
     draws.bit_generator.state = env.np_random.bit_generator.state
     xs, ys, us, rewards = [env.x], [env.y], [], []
-    for t in range(8):
-        action = actions.uniform(-1.5, 1.5, 2)
+    for action in actions.uniform(-1.5, 1.5, (8, 2)):
         noise = draws.standard_normal((process.integration_steps + 1, 2))  # of the process, then of the observation
-        _, gained, ended, truncated, info = env.step(action)
+        _, gained, ended, _, info = env.step(action)
         expected = process.step(*(torch.tensor(value)[None] for value in (xs[-1], info["u"], noise[:-1].ravel())))
         np.testing.assert_allclose(info["x"], expected[0], rtol=1e-12)
         np.testing.assert_allclose(info["y"], process.observe(expected, torch.tensor(noise[-1])[None])[0], rtol=1e-12)
-        assert (ended, truncated) == (t == 7, False)
         xs, ys, us, rewards = [*xs, info["x"]], [*ys, info["y"]], [*us, info["u"]], [*rewards, gained]
+    assert ended
     x, y, u = (torch.tensor(np.array(values))[:, None] for values in (xs, ys, us))
     np.testing.assert_allclose(rewards, reward(Trajectories(x, y, u, u))[:, 0], rtol=1e-10)
 
@@ -164,7 +160,7 @@ def test_the_environment_is_the_process_with_its_reward(workload, signal):
 def test_the_library_learns_with_our_layers_one_batch_a_run(workload):
     subject = workload.library(3, 4, 1)
     model = subject.run.func.__self__
-    assert [(layer.hidden_size, layer.num_layers) for layer in [model.policy.lstm_actor]] == [(20, 2)]
+    assert (model.policy.lstm_actor.hidden_size, model.policy.lstm_actor.num_layers) == (20, 2)
     subject.run()
     before = model.num_timesteps
     subject.run()
@@ -177,10 +173,9 @@ def test_a_quick_run_writes_everything_and_peak_memory_is_that_of_learning_alone
     monkeypatch.setattr(benchmark, "peak_memory", lambda sizes: {(K, T): 0.1 * K * T for K, T in sizes})  # a process a size
     monkeypatch.setattr(benchmark, "code_revision", lambda _: "abc+changes" if any(tmp_path.iterdir()) else "abc")
     assert benchmark.main(["--quick", "--out", str(tmp_path)]) == 0
-    names = {"benchmarks.csv", "exponents.csv", "machine.md", "scaling.svg", "summary.md"}
-    assert {path.name for path in tmp_path.iterdir()} == names
+    tables, texts = {"benchmarks.csv", "exponents.csv"}, ["summary.md", "machine.md", "scaling.svg"]
+    assert {path.name for path in tmp_path.iterdir()} == {*tables, *texts}
     frame = pd.read_csv(tmp_path / "benchmarks.csv")
-    assert list(frame.columns[:6]) == FIRST_COLUMNS
     compared = frame[~frame["what"].str.startswith("scaling")]
     rows = set(compared[["what", "threads"]].itertuples(index=False, name=None))
     of_ours = product((subjects.OURS, subjects.OURS_AS_SET, subjects.BOUND, subjects.GATES), (1, 2))
@@ -189,28 +184,27 @@ def test_a_quick_run_writes_everything_and_peak_memory_is_that_of_learning_alone
     assert len(frame) - len(compared) == len(subjects.scaling_sizes(subjects.QUICK))
     assert (frame[["steps_per_s", "ratio_to_bound", "seconds_min"]] > 0).all(axis=None)
     assert frame["seconds"].between(frame["seconds_min"], frame["seconds_max"]).all()
-    texts = {name: (tmp_path / name).read_text(encoding="utf-8") for name in ("summary.md", "machine.md", "scaling.svg")}
-    assert texts["summary.md"].index("Ratio") < texts["summary.md"].index("Seconds")
-    assert subjects.ONE_AT_A_TIME in texts["summary.md"]
-    assert not [name for name in texts for place in (Path.home(), subjects.PROJECT, platform.node()) if str(place) in texts[name]]
-    row = next(line for line in texts["machine.md"].splitlines() if "code" in line.lower())
+    summary, machine, drawing = ((tmp_path / name).read_text(encoding="utf-8") for name in texts)
+    assert summary.index("Ratio") < summary.index("Seconds")
+    assert subjects.ONE_AT_A_TIME in summary
+    places = (Path.home(), subjects.PROJECT, platform.node())
+    assert [place for place in places if str(place) in summary + machine + drawing] == []
+    row = next(line for line in machine.splitlines() if "code" in line.lower())
     assert row.split("|")[2].strip() == "abc"  # what a run writes is no change of the code that it measured
 
 
 def test_stages_are_read_from_the_records_of_the_run(tmp_path):
     """One stage with two results is one row; the report has no record of its own."""
     log = "results/paper/seed_0/case_3/notebooks/04_knowledge_transfer_improved.ipynb"
-    jobs = {"b": ([log], 20.0, 32.0), "c": ([log], 20.0, 32.0), "a": (["reports/notebooks/05_report.ipynb"], 40.0, 45.0)}
-    files = {
-        f".snakemake/metadata/{name}": dict(zip(("log", "starttime", "endtime"), job, strict=True)) for name, job in jobs.items()
-    }
+    job, report = ({"log": [path]} for path in (log, "reports/notebooks/05_report.ipynb"))
+    files = {f".snakemake/metadata/{name}": job | {"starttime": 20.0, "endtime": 32.0} for name in "bc"}
+    files[".snakemake/metadata/a"] = report | {"starttime": 40.0, "endtime": 45.0}
     for folder, seconds in (("transfer_improved", 5.0), ("online_improved", 7.5), ("transfer_printed", 9.0)):
         record = {"notebook": "04_knowledge_transfer", "variant": folder.partition("_")[2], "seconds": seconds}
         files[f"results/paper/seed_0/case_3/{folder}/record.json"] = record
     for name, content in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(json.dumps(content))
-    assert [tuple(row[name] for name in whole_run.COLUMNS) for row in whole_run.stage_times(tmp_path)] == [
-        ("04_knowledge_transfer", 3, "improved", 12.0, 7.5, 4.5),
-        ("05_report", None, "", 5.0, 0.0, 5.0),
-    ]
+    transfer, report = ([row[name] for name in whole_run.COLUMNS] for row in whole_run.stage_times(tmp_path))
+    assert transfer == ["04_knowledge_transfer", 3, "improved", 12.0, 7.5, 4.5]
+    assert report == ["05_report", None, "", 5.0, 0.0, 5.0]

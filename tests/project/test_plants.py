@@ -1,6 +1,7 @@
 """The plants that taught no controller: their channels, their records, and what is told of them."""
 
 from concurrent.futures import ThreadPoolExecutor
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -32,14 +33,10 @@ def test_a_record_covers_its_range_and_is_that_of_its_seed():
 
 
 def test_the_summary_holds_medians_and_verdicts():
-    rows = [
-        (seed, truth, name, share * (1 + seed), seed > 0)
-        for seed in range(3)
-        for truth, share in (("as recorded", 0.4), ("other", 0.5))
-        for name in (gate.RECORD, gate.POLICY)
-    ]
-    found = pd.DataFrame(rows, columns=["seed", "truth", "controller", "mean |e|", "released"])
-    told = plants.summary(found.assign(plant="tank", movement=1.0, offset=0.01, keep=gate.POLICY, seconds=60.0))
+    places = product(range(3), ("as recorded", "other"), (gate.RECORD, gate.POLICY))
+    found = pd.DataFrame(places, columns=["seed", "truth", "controller"]).assign(plant="tank", keep=gate.POLICY, seconds=60.0)
+    errors = found["truth"].map({"as recorded": 0.4, "other": 0.5}) * (1 + found["seed"])
+    told = plants.summary(found.assign(movement=1.0, offset=0.01, released=found["seed"] > 0, **{"mean |e|": errors}))
     line = next(row for row in told.splitlines() if row.startswith("| tank") and gate.POLICY in row)
     assert [cell.strip() for cell in line.split("|")[2:-1]] == [gate.POLICY, "0.800", "1.000", "0.010", "1.000"]
     assert "2 of 3" in told
@@ -55,8 +52,7 @@ def test_what_was_judged_at_the_same_commit_is_not_judged_again(tmp_path, monkey
         return pd.DataFrame([row | {"controller": gate.POLICY, "mean |e|": 0.9, "movement": 1.0, "offset": 0.0}])
 
     names = {"FOUND": tmp_path, "SO_FAR": tmp_path / "results/plants.csv", "judged": judged}
-    names |= {"ProcessPoolExecutor": ThreadPoolExecutor, "code_revision": lambda _: "abc"}
-    for name, value in names.items():
+    for name, value in (names | {"ProcessPoolExecutor": ThreadPoolExecutor, "code_revision": lambda _: "abc"}).items():
         monkeypatch.setattr(plants, name, value)
     for seeds, new in (("1", 8), ("1", 0), ("2", 8)):
         asked.clear()

@@ -13,6 +13,8 @@ import pickle
 import re
 import shutil
 import time
+from functools import cache, reduce
+from operator import getitem
 
 import pandas as pd
 import pytest
@@ -27,7 +29,6 @@ from helpers.plant.rollout import rollout, stream
 from helpers.report.claims import load_claims
 from helpers.runs import identity
 from helpers.runs.artifacts import load_stage, save_stage, trajectories_from_table, trajectories_to_table
-from helpers.runs.identity import inputs
 from helpers.runs.sources import PROJECT
 from helpers.settings.evidence import load_experiments, load_identification
 from helpers.settings.leaf import InputError, read_yaml
@@ -47,8 +48,7 @@ NOTEBOOKS = {path.stem: CASE_OF[path.stem[:2]] for path in (PROJECT / "notebooks
 
 def some(share):
     """Settings for a share of all cases."""
-    health = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much]
-    fixed = {"deadline": None, "database": None, "derandomize": True, "suppress_health_check": health}
+    fixed = {"deadline": None, "database": None, "derandomize": True, "suppress_health_check": [*HealthCheck]}
     return settings(max_examples=math.ceil(share * CASES), **fixed)
 
 
@@ -67,32 +67,17 @@ def outcome(action, *names):
         assert time.process_time() - began < SLOWEST
 
 
-ODD_NUMBERS = [0, -1, 1, 2, 10**400, -0.0, 1e308, 1e-308, math.nan, math.inf, -math.inf, 2**63]
-SCALARS = st.one_of(
-    st.none(), st.booleans(), st.sampled_from(ODD_NUMBERS), st.integers(-9, 9), st.floats(width=32), st.text(max_size=8), st.dates()
-)
-ANYTHING = st.recursive(
-    SCALARS,
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5) | st.integers(0, 3), inner, max_size=3),
-    max_leaves=6,
-)
+FEW = st.integers(0, 9)
+NUMBERS = st.sampled_from([0, -1, 1, 2, 10**400, -0.0, 1e308, 1e-308, math.nan, math.inf, -math.inf, 2**63])
+SCALARS = st.none() | st.booleans() | NUMBERS | st.integers(-9, 9) | st.floats(width=32) | st.text(max_size=8) | st.dates()
+KEYS = st.text(max_size=5) | st.integers(0, 3)
+ANYTHING = st.recursive(SCALARS, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(KEYS, inner, max_size=3), max_leaves=6)
 BOMB = "\n".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9) if n else 'x'}]" for n in range(30))
-LINES = [
-    "!!python/object/apply:os.system ['touch exploded']",
-    "extra: !!python/object/new:os.system ['touch exploded']",
-    "extra: !!python/name:os.system",
-    "extra: !unknown x",
-    "extra: &a [*a]",
-    "extra: {<<: *nowhere}",
-    f"extra: {'[' * 3000}",
-    "extra: 1\nextra: 2",
-    "? [a, b]\n: c",
-    "--- second document",
-    "\t- tab",
-    "extra: \x07",
-    "extra: 0x1F",
-    BOMB,
-]
+LINES = ["!!python/object/apply:os.system ['touch exploded']", "extra: !!python/object/new:os.system ['touch exploded']"]
+LINES += ["extra: !!python/name:os.system", "extra: !unknown x", "extra: &a [*a]", "extra: {<<: *nowhere}", "extra: 1\nextra: 2"]
+LINES += [f"extra: {'[' * 3000}", "? [a, b]\n: c", "--- second document", "\t- tab", "extra: \x07", "extra: 0x1F", BOMB]
+DTYPES = st.sampled_from([torch.float32, torch.float64])
+CELLS = st.floats() | st.integers() | st.text(max_size=5) | st.none() | st.booleans() | st.sampled_from(["1e999", "0x1", "1_000"])
 
 
 def nodes(content, path=()):
@@ -113,17 +98,11 @@ def parameter_files(draw):
         content = read_yaml(PARAMS / name)
         places = sorted(nodes(content), key=str)
         *path, last = draw(st.sampled_from(places))
-        parent = content
-        for key in path:
-            parent = parent[key]
+        parent = reduce(getitem, path, content)
         if kind == "value":
             parent[last] = draw(ANYTHING)
         elif kind == "swap":
-            *other, other_last = draw(st.sampled_from(places))
-            value = content
-            for key in (*other, other_last):
-                value = value[key]
-            parent[last] = copy.deepcopy(value)
+            parent[last] = copy.deepcopy(reduce(getitem, draw(st.sampled_from(places)), content))
         else:
             value = parent.pop(last)
             if kind == "rename" and isinstance(parent, dict):
@@ -140,51 +119,34 @@ def parameter_files(draw):
     return name, "\n".join(lines).encode()
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A folder of parameter files, one of which each case replaces."""
-    return tmp_path_factory.mktemp("params")
-
-
 def load_everything(root):
     """Every loader of parameter files, as the notebooks use them."""
     params = {case: load(root, case) for case in (1, 2, 3)}
-    load_published(root)
-    load_experiments(root, params[1])
-    load_identification(root, params[1])
-    load_claims(root)
-    load_limits(root, params[1])
-    load_one_policy(root, params[1])
-    load_search(root)
-    load_own_plant(root)
+    for load_whole in (load_published, load_claims, load_search, load_own_plant):
+        load_whole(root)
+    for load_for in (load_experiments, load_identification, load_limits, load_one_policy):
+        load_for(root, params[1])
     load_tank(root, params[1].process)
     for notebook, case in NOTEBOOKS.items():
-        inputs(notebook, root, "smoke", case)
-    return params
+        identity.inputs(notebook, root, "smoke", case)
 
 
 @pytest.fixture
 def same_versions(monkeypatch):
     """What is installed does not depend on the files, and to ask for it again and again takes longer than all loaders."""
-    found = identity.versions()
-    monkeypatch.setattr(identity, "versions", lambda: found)
+    monkeypatch.setattr(identity, "versions", cache(identity.versions))
 
 
 @pytest.mark.usefixtures("same_versions")
 @some(0.4)
 @given(mutated=parameter_files())
-def test_mutated_parameter_files(folder, monkeypatch, mutated):
-    monkeypatch.chdir(folder)
-    for path in PARAMS.glob("*.yaml"):
-        (folder / path.name).write_bytes(path.read_bytes())
+def test_mutated_parameter_files(tmp_path, monkeypatch, mutated):
+    monkeypatch.chdir(tmp_path)
+    folder = shutil.copytree(PARAMS, tmp_path / "params", dirs_exist_ok=True)
     name, raw = mutated
     (folder / name).write_bytes(raw)
     outcome(lambda: load_everything(folder), *(f"{folder / file}: " for file in FILES))
-    assert not (folder / "exploded").exists()
-
-
-def test_the_committed_files_pass(root):
-    assert set(load_everything(root)) == {1, 2, 3}
+    assert not (tmp_path / "exploded").exists()
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -198,32 +160,13 @@ def test_every_file_is_among_those_that_are_loaded(root, tmp_path, name):
         load_everything(tmp_path)
 
 
-def pickled_by_torch():
-    buffer = io.BytesIO()
-    torch.save({"a": Bomb()}, buffer)
-    return buffer.getvalue()
-
-
-FORGED = [b"", b"{}", b"null", pickle.dumps(Bomb()), pickled_by_torch(), b"\x93NUMPY\x01\x00", bytes(range(256))]
+PICKLED = io.BytesIO()
+torch.save({"a": Bomb()}, PICKLED)
+PICKLES = [pickle.dumps(Bomb()), PICKLED.getvalue()]
+FORGED = st.sampled_from([b"", b"{}", b"null", *PICKLES, b"\x93NUMPY\x01\x00", bytes(range(256))])
 STAGE_FILES = ["record.json", "table.csv", "policy.safetensors"]
-RECORDS = st.dictionaries(st.sampled_from(["files", "seed", "inputs", "upstream"]), ANYTHING, max_size=4)
-
-
-@st.composite
-def changes_of_files(draw):
-    """The name of one of a stage's files, and a function that changes its bytes."""
-    name = draw(st.sampled_from(STAGE_FILES))
-    kind = draw(st.sampled_from(["cut", "noise", "noise", "forged", "json"]))
-    place, noise, length = draw(st.floats(0, 1)), draw(st.binary(max_size=9)), draw(st.integers(0, 9))
-    forged = draw(st.sampled_from(FORGED))
-    if kind == "json":
-        forged = json.dumps(draw(RECORDS | ANYTHING), default=str).encode()
-
-    def change(raw):
-        at = round(place * len(raw))
-        return {"cut": raw[:at], "noise": raw[:at] + noise + raw[at + length :]}.get(kind, forged)
-
-    return name, change, draw(st.booleans())
+ENTRIES = st.dictionaries(st.sampled_from(["files", "seed", "inputs", "upstream"]), ANYTHING, max_size=4)
+RECORDS = (ENTRIES | ANYTHING).map(lambda record: json.dumps(record, default=str).encode())
 
 
 @pytest.fixture(scope="module")
@@ -243,14 +186,17 @@ def stage_of(tmp_path_factory, study):
 
 
 @some(0.35)
-@given(mutation=changes_of_files())
-def test_mutated_artifacts(stage_of, monkeypatch, mutation):
+@given(data=st.data(), name=st.sampled_from(STAGE_FILES), sealed=st.booleans())
+def test_mutated_artifacts(stage_of, monkeypatch, data, name, sealed):
+    """One of a stage's files is cut, holds noise, or is forged."""
     folder, good, read = stage_of
     monkeypatch.chdir(folder.parent)
-    name, change, sealed = mutation
-    for file, raw in good.items():
-        (folder / file).write_bytes(raw)
-    (folder / name).write_bytes(change(good[name]))
+    for file, content in good.items():
+        (folder / file).write_bytes(content)
+    raw, places = good[name], st.integers(0, len(good[name]))
+    cut = places.map(lambda at: raw[:at])
+    noise = st.builds(lambda at, noise, length: raw[:at] + noise + raw[at + length :], places, st.binary(max_size=9), FEW)
+    (folder / name).write_bytes(data.draw(cut | noise | FORGED | RECORDS))
     if sealed and name != "record.json":  # a record that was forged along with it does not help
         record = json.loads(good["record.json"])
         record["files"][name] = hashlib.sha256((folder / name).read_bytes()).hexdigest()
@@ -261,45 +207,27 @@ def test_mutated_artifacts(stage_of, monkeypatch, mutation):
     assert not (folder.parent / "exploded").exists()
 
 
-CELLS = st.one_of(
-    st.floats(), st.integers(), st.text(max_size=5), st.none(), st.booleans(), st.sampled_from(["1e999", "0x1", "1_000"])
-)
-
-
 @pytest.fixture(scope="module")
 def recorded(study):
-    """A table of demonstrations."""
     case = study(1)
     return trajectories_to_table(rollout(case.process, case.pid, case.task, 3, stream(0, "properties")), *NAMES, 0.04)
 
 
-@st.composite
-def changes_of_tables(draw):
-    """A function that changes the text of a table of demonstrations: a cell, a column, the order of its rows, or any part."""
-    kind = draw(st.sampled_from(["cell", "column", "order", "text"]))  # what is missing or twice is tested by hand
-    row, column, seed = draw(st.integers(0, 10**6)), draw(st.integers(0, 10**6)), draw(st.integers(0, 99))
-    value, noise = draw(CELLS), draw(st.text(max_size=9))
-
-    def change(table):
-        changed = table.sample(frac=1, random_state=seed).astype(object)
-        place = column % len(table.columns)
-        if kind == "cell":
-            changed.iloc[row % len(table), place] = value
-        elif kind == "column":
-            changed.iloc[:, place] = [value] * len(table)
-        text = changed.to_csv(index=False)
-        at = row % len(text)
-        return text[:at] + noise + text[at + seed :] if kind == "text" else text
-
-    return change
-
-
 @some(0.25)
-@given(change=changes_of_tables(), dtype=st.sampled_from([torch.float32, torch.float64]))
-def test_mutated_tables_of_demonstrations(tmp_path, recorded, change, dtype):
+@given(data=st.data(), kind=st.sampled_from(["cell", "column", "order", "text"]), dtype=DTYPES)
+def test_mutated_tables_of_demonstrations(tmp_path, recorded, data, kind, dtype):
+    """A cell, a column, the order of the rows, or any part of the text; what is missing or twice is tested by hand."""
+    table = recorded.sample(frac=1, random_state=data.draw(st.integers(0, 99))).astype(object)
+    row, column = (data.draw(st.integers(0, length - 1)) for length in table.shape)
+    if kind in ("cell", "column"):
+        table.iloc[row if kind == "cell" else slice(None), column] = data.draw(CELLS)
+    text = table.to_csv(index=False)
+    if kind == "text":
+        at = data.draw(st.integers(0, len(text)))
+        text = text[:at] + data.draw(st.text(max_size=9)) + text[at + data.draw(st.integers(0, 99)) :]
     stage = save_stage(tmp_path / "stage", {}, {"demonstrations.csv": recorded})
-    stage.path("demonstrations.csv").write_text(change(recorded), encoding="utf-8")
     path = stage.path("demonstrations.csv")
+    path.write_text(text, encoding="utf-8")
     found = outcome(lambda: trajectories_from_table(stage.table("demonstrations.csv"), *NAMES, dtype, path), f"{path}: ")
     if found is not None:
         assert all(signal.isfinite().all() for signal in vars(found).values())

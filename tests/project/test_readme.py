@@ -3,19 +3,19 @@
 import json
 import re
 import shlex
+from itertools import takewhile
+from pathlib import Path
 
-import nbformat
 import pandas as pd
 import pytest
 
 from helpers.__main__ import COMMANDS
 from helpers.report.publish import GLANCE
+from helpers.runs.request import parameter_names
 from helpers.runs.sources import PROJECT
 
-PAGES = {
-    path.relative_to(PROJECT).as_posix(): path.read_text(encoding="utf-8")
-    for path in [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
-}
+PATHS = [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
+PAGES = {path.relative_to(PROJECT).as_posix(): path.read_text(encoding="utf-8") for path in PATHS}
 ALL = "\n".join(PAGES.values())
 REFERENCE = PROJECT / "reports/reference"
 LINK = re.compile(r"""(?:\]\(|src=")([^)"]+)""")
@@ -77,9 +77,9 @@ def test_what_follows_from_the_limits_is_what_the_reference_run_shows():
         table = pd.read_csv(REFERENCE / f"tables/limits_{name}.csv").set_index(index)
         return table.map(lambda cell: float(str(cell).split(" ")[0]))
 
-    gaps = medians("gaps", "controller")
-    others = gaps.drop(["one policy, through the model", "minimum variance on x", "programme, filtered y", "programme on x"])
-    assert (gaps.loc["one policy, through the model"] <= others).all(axis=None)
+    gaps, one_policy = medians("gaps", "controller"), "one policy, through the model"
+    others = gaps.drop([one_policy, "minimum variance on x", "programme, filtered y", "programme on x"])
+    assert (gaps.loc[one_policy] <= others).all(axis=None)
     assert (gaps.loc["online policy"] - gaps.loc["minimum variance on y"]).max() < 1
     there = medians("improved", ["controller", "case"])
     for name in ("minimum variance on y", "offset-free MPC"):
@@ -117,12 +117,14 @@ def test_links_lead_to_files_and_headings(page, link):
         assert anchor in anchors(target.read_text(encoding="utf-8"))
 
 
-def test_the_targets_and_settings_named_exist():
+def test_the_targets_and_settings_named_exist_and_every_parameter_file_is_listed():
     makefile = (PROJECT / "Makefile").read_text(encoding="utf-8")
     targets = set(re.findall(r"^(\w+):", makefile, re.MULTILINE))
     named = set(re.findall(r"(?:^|`)make (\w+)", ALL, re.MULTILINE))
     assert targets - {"help"} <= named <= targets
     assert all(f"$({name})" in makefile or f"({name})," in makefile for name in re.findall(r"`make[^`]* ([A-Z]+)=", ALL))
+    listed = set(re.findall(r"params/(\w+\.yaml)\)", PAGES["docs/parameters.md"]))
+    assert listed == {path.name for path in (PROJECT / "params").glob("*.yaml")}
 
 
 @pytest.mark.parametrize("line", [line for line in COMMAND_LINES if " -m helpers " in line or " -m snakemake " in line])
@@ -134,23 +136,13 @@ def test_the_commands_of_helpers_and_snakemake_name_what_there_is(line):
         return
     assert (PROJECT / words[words.index("--profile") + 1] / "config.yaml").is_file()
     snakefile = (PROJECT / "Snakefile").read_text(encoding="utf-8")
-    for setting in words[words.index("--config") + 1 :]:
-        if setting.startswith("--"):
-            break
-        assert f'config.get("{setting.split("=")[0]}"' in snakefile
-
-
-def test_every_parameter_file_is_listed():
-    listed = set(re.findall(r"params/(\w+\.yaml)\)", PAGES["docs/parameters.md"]))
-    assert listed == {path.name for path in (PROJECT / "params").glob("*.yaml")}
+    settings = takewhile(lambda word: not word.startswith("--"), words[words.index("--config") + 1 :])
+    assert all(f'config.get("{setting.split("=")[0]}"' in snakefile for setting in settings)
 
 
 def test_the_papermill_commands_name_notebooks_and_their_parameters():
     commands = [shlex.split(line) for line in COMMAND_LINES if line.startswith("papermill ")]
     assert {command[1][10:12] for command in commands} >= {"01", "02", "03", "04"}
     for _, path, _, *options in commands:
-        cells = nbformat.read(PROJECT / path, as_version=4).cells
-        (parameters,) = [cell.source for cell in cells if "parameters" in cell.metadata.get("tags", [])]
-        for flag, name, _ in zip(*[iter(options)] * 3, strict=True):
-            assert flag == "-p"
-            assert re.search(rf"^{name} = ", parameters, re.MULTILINE)
+        assert {*options[::3]} <= {"-p"}
+        assert {*options[1::3]} <= {*parameter_names(Path(path).stem)}

@@ -25,7 +25,6 @@ def dry_make(tmp_path):
         make = ["make", "--dry-run", target, *words]
         return subprocess.run(make, cwd=tmp_path, env=clean | environment, capture_output=True, text=True, check=True).stdout
 
-    commands.folder = tmp_path
     return commands
 
 
@@ -36,10 +35,10 @@ def test_the_number_of_seeds_is_that_of_the_command_line_the_environment_or_the_
     assert " seeds=4 " in dry_make(target, "SEEDS=4", SEEDS="3")
 
 
-def test_a_resumed_run_installs_nothing_and_so_needs_no_network(dry_make):
+def test_a_resumed_run_installs_nothing_and_so_needs_no_network(dry_make, tmp_path):
     assert "pip" not in dry_make("evidence")
-    (dry_make.folder / ".venv/alternatives").unlink()
+    (tmp_path / ".venv/alternatives").unlink()
     assert dry_make("evidence").count("pip install") == 1
     assert "pip" not in dry_make("reports")
-    (dry_make.folder / "environment.txt").touch()
+    (tmp_path / "environment.txt").touch()
     assert dry_make("evidence").count("pip install") == 3

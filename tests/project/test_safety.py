@@ -15,6 +15,7 @@ MODULES = sorted((PROJECT / "src/helpers").rglob("*.py"))
 NETWORK = {"socket", "urllib", "http", "requests", "httpx", "ftplib", "smtplib", "ssl", "telnetlib", "xmlrpc"}
 LOADS_CODE = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib", "runpy", "code"}
 CALLS = {"eval", "exec", "compile", "__import__", "load_module", "read_pickle", "unsafe_load", "full_load", "system", "popen"}
+KEPT = ["src/x.ipynb", "notebooks/x.ipynb", "results/../x.ipynb", "reports/template", "reports/latest/../reference"]
 
 
 def imported(tree):
@@ -53,9 +54,7 @@ def test_no_name_of_a_trial_can_lead_out_of_the_results(tmp_path):
             load_trials(tmp_path)
 
 
-@pytest.mark.parametrize(
-    "place", ["src/x.ipynb", "notebooks/x.ipynb", "results/../x.ipynb", "reports/template", "reports/latest/../reference"]
-)
+@pytest.mark.parametrize("place", KEPT)
 def test_no_run_writes_over_what_the_project_is_made_of_nor_what_it_keeps(tmp_path, place):
     (tmp_path / "link").symlink_to(PROJECT)
     for project in (PROJECT, tmp_path / "link"):

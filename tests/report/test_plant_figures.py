@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from matplotlib.figure import Figure
 
 from helpers.learning.model_gradient import GradientRecord
 from helpers.learning.tracking_policy import Gains, TrackingPID
@@ -48,29 +47,24 @@ def test_the_quality_figure_has_a_panel_a_variable_with_its_unit(plant):
 
 
 def test_an_episode_is_shown_in_engineering_units_under_every_controller(plant, model):
-    none = torch.zeros(3)
+    one = torch.ones(3)
     bounds = Bounds(torch.tensor([-3.0, -3.0]), torch.tensor([3.0, 3.0]), torch.full((2,), torch.inf))
-    operation = Operation((0,), none - 1, none + 1, none + 1, bounds)
     record = Gains(*(torch.eye(2, 3) for _ in range(3)))
-    workshop = learn.Workshop(plant, operation, record, 1.0, *[model.to(torch.float32)] * 4)
-    pid = TrackingPID(record, workshop.operation.bounds)
+    workshop = learn.Workshop(plant, Operation((0,), -one, one, one, bounds), record, 1.0, *[model.to(torch.float32)] * 4)
+    pid = TrackingPID(record, bounds)
     figure = plant_figures.loops_figure(workshop, {gate.RECORD: pid, gate.POLICY: pid}, plant.description)
     shown = drawn_summary(figure).set_index(["panel", "artist"])
     assert [axis.get_label() for axis in figure.axes] == [*plant.controlled, *plant.manipulated]
-    assert "set point" in shown.loc["y0"].index
-    assert "set point" not in shown.loc["y1"].index
-    steady = plant.description.controlled[1].steady_state
-    assert shown.loc[("y1", gate.POLICY), "mean"] == pytest.approx(shown.loc[("y1", gate.RECORD), "mean"])
-    assert abs(shown.loc[("y1", gate.POLICY), "mean"] - steady) < 10
+    assert ["set point" in shown.loc[output].index for output in ("y0", "y1")] == [True, False]
+    policy, pid_s = (shown.loc[("y1", name), "mean"] for name in (gate.POLICY, gate.RECORD))
+    assert policy == pytest.approx(pid_s)
+    assert abs(policy - plant.description.controlled[1].steady_state) < 10
 
 
 def test_the_gate_s_figure_shows_the_rivals_and_the_curves_their_levels():
-    rng = np.random.default_rng(0)
-    parts = [
-        pd.DataFrame({"mean |e|": rng.uniform(0.5, 1, 50), "movement": rng.uniform(0.5, 1, 50), "controller": name})
-        for name in gate.SIMPLEST
-    ]
-    figure = plant_figures.gate_figure(gate.Verdict(pd.DataFrame(), pd.concat(parts), True, gate.POLICY, ""))
+    shares = pd.DataFrame(np.random.default_rng(0).uniform(0.5, 1, (200, 2)), columns=["mean |e|", "movement"])
+    shares["controller"] = [*gate.SIMPLEST] * 50
+    figure = plant_figures.gate_figure(gate.Verdict(pd.DataFrame(), shares, True, gate.POLICY, ""))
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == [gate.TUNED, gate.PREDICTIVE, gate.POLICY]
     assert figure.axes[1].get_xlabel() == "movement, share of the record's PID's"
     curves = plant_figures.progress_figure([GradientRecord(n, 1 / n, 0.9, 0.1, 0.2) for n in range(1, 6)])
@@ -96,9 +90,6 @@ def test_a_trial_goes_from_manual_to_policy_to_hold_to_pid_and_back(plant, model
     modes = steps["mode"].ne(steps["mode"].shift()).cumsum()
     assert steps.groupby(modes)["mode"].first().tolist() == ["manual", "policy", "hold", "PID", "policy"]
     assert len(seconds) == len(steps) == 60
-    assert steps["y1"].isna().sum() == 10
-    assert steps["y0_sp"].nunique() == 2
-    figure = plant_figures.guard_figure(steps, plant.description)
-    assert isinstance(figure, Figure)
-    shown = drawn_summary(figure)
+    assert (steps["y1"].isna().sum(), steps["y0_sp"].nunique()) == (10, 2)
+    shown = drawn_summary(plant_figures.guard_figure(steps, plant.description))
     assert shown.query("panel == 'u1' and artist == 'u1'")["last"].item() == pytest.approx(steps["u1"].iloc[-1])

@@ -5,7 +5,6 @@ import ctypes
 import re
 import shutil
 import subprocess
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -30,13 +29,13 @@ def written(tmp_path_factory, study):
     """The policies of Case III of the committed smoke run, and a made-up one for all cases."""
     first, folder = tmp_path_factory.mktemp("first"), tmp_path_factory.mktemp("policies")
     shutil.copytree(SMOKE / "case_3", first / "case_3")  # C source takes its time: one case will do
-    cases = {case: replace(study(case), case=case) for case in (1, 2, 3)}
-    target, task = torch.stack([found.task.set_point for found in cases.values()]), cases[1].task
+    params, task = study(1).params.learning.policy, study(1).task
+    target = torch.stack([study(case).task.set_point for case in (1, 2, 3)])
     gains = Gains(*(size * torch.eye(2, dtype=torch.float64) for size in (5.0, 3.0, 0.0)))
     middle, reach = (target.amax(0) + target.amin(0)) / 2, (target.amax(0) - target.amin(0)) / 2
     torch.manual_seed(0)
     bounds = Bounds(task.input_low, task.input_high, reach)
-    policy = TrackingPolicy(cases[1].params.learning.policy, gains, task.set_point.abs(), middle, reach, bounds, kept=0.8)
+    policy = TrackingPolicy(params, gains, task.set_point.abs(), middle, reach, bounds, kept=0.8)
     torch.nn.init.normal_(policy.output.weight, std=0.1)
     record = {"notebook": "09_one_policy", "seed": 0, "scale": "smoke", "revision": "0"}
     save_stage(first / "case_1/one_policy", record, {}, policy)
@@ -64,10 +63,10 @@ def holds(name, folder):
 def test_a_written_policy_holds_its_score(written, name):
     holds(name, written)
     if name != "one_policy":
-        stage = "transfer" if name.endswith("offline") else "online"
-        told = pd.read_csv(SMOKE / f"case_3/{stage}_improved/scores.csv").set_index(["stage", "metric"])["value"]
-        scores = load_policy(name, written).card["scores"]["3"]
-        assert scores["policy"] == pytest.approx(told[name.split("_")[-1], "objective_x"], rel=1e-3)
+        stage = name.removeprefix("case_3_")
+        folder = {"offline": "transfer_improved", "online": "online_improved"}[stage]
+        told = pd.read_csv(SMOKE / "case_3" / folder / "scores.csv").set_index(["stage", "metric"])["value"]
+        assert load_policy(name, written).card["scores"]["3"]["policy"] == pytest.approx(told[stage, "objective_x"], rel=1e-3)
     card = (written / f"{name}.md").read_text(encoding="utf-8")
     assert all(f"**{word}" in card for word in ("Trained on**", "For set points**", "Measured**", "Not for**"))
 

@@ -1,6 +1,7 @@
 """What may become the committed reference run, and what goes into it."""
 
 import json
+import re
 import subprocess
 from itertools import product
 from pathlib import Path
@@ -11,17 +12,10 @@ from helpers.report import publish
 from helpers.report.publish import PublishError, check, executed_copy
 from helpers.runs.sources import PROJECT
 
-REVISION = "0123abcd" * 5
+REVISION, OTHER = "0123abcd" * 5, "f" * 40
+CHANGED = REVISION + "+changes"
 GOOD = {"scale": "paper", "revision": REVISION, "revisions_of_stages": [REVISION], "seeds": [0, 1], "missing_seeds": []}
 GOOD |= {"stage_seconds": 7200}
-OTHER = "f" * 40
-
-
-def executed(what):
-    return json.dumps({"cells": [], "metadata": {"what": what}})
-
-
-CHANGED = REVISION + "+changes"
 REFUSED = {
     "smoke scale": ({"scale": "smoke"}, None, REVISION, "smoke scale"),
     "fewer seeds": ({}, {"seeds": [0, 1, 2]}, REVISION, "2 seeds, the published one 3"),
@@ -32,129 +26,14 @@ REFUSED = {
     "seeds that failed": ({"missing_seeds": [3, 7]}, None, REVISION, "lacks the seeds 3, 7"),
     "no checkout": ({"revision": "unknown", "revisions_of_stages": ["unknown"]}, None, "unknown", "unknown"),
 }
-
-
-@pytest.mark.parametrize(("changes", "reference", "revision", "says"), REFUSED.values(), ids=REFUSED)
-def test_only_a_clean_run_at_paper_scale_is_accepted(changes, reference, revision, says):
-    check(GOOD, {"seeds": [0, 1]}, REVISION)
-    with pytest.raises(PublishError) as caught:
-        check(GOOD | changes, reference, revision)
-    assert says in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-README = (
-    "# Title\n<!-- glance: a -->\nold\n<!-- /glance -->\nmiddle\n<!-- cost: d -->\n<!-- /cost -->\n"
-    "<!-- limits: c -->\n<!-- /limits -->\nend\n"
-)
+README = "# Title\n<!-- glance: a -->\nold\n<!-- /glance -->\nmiddle\n<!-- cost: d -->\n<!-- /cost -->\n"
+README += "<!-- limits: c -->\n<!-- /limits -->\nend\n"
 RUNNING = "# Running it\n<!-- time: b -->\n<!-- /time -->\nend\n"
 GAPS = """\
 case,n_seeds,feature_gap,feature_gap_low,feature_gap_high,published_gap,expert_error,expert_error_low,expert_error_high,online_share,printed_gap
 1,20,0.2,0.15,0.31,0.1,0.01,0.009,0.012,0.951,0.4
 2,20,0.03,0.02,0.04,0.137,0.02,0.02,0.02,,
 """
-
-
-@pytest.fixture
-def project(monkeypatch, tmp_path):
-    """A project with a finished run."""
-    latest, results = tmp_path / "reports/latest", tmp_path / "results"
-    files = {
-        latest / "report.html": "<html>",
-        latest / "report.pdf": "%PDF",
-        latest / "report.md": "# Summary",
-        latest / "figures/figure_3.png": "picture",
-        latest / "tables/table_2.csv": "a,b",
-        latest / "tables/time.csv": "case,stage,seconds\n1,demonstrations,2.4\n2,demonstrations,3.6\n1,offline_improved,20.2\n",
-        latest / "tables/gaps.csv": GAPS,
-        latest / "comparison.csv": "a,b",
-        latest / "seeds.csv": "case,seed,stage,metric,value\n1,0,offline,feature_gap,0.2\n",
-        latest / "provenance.json": json.dumps(GOOD),
-        latest / "notebooks/05_report.ipynb": executed("05"),
-        results / "paper/seed_0/case_1/notebooks/02_offline_irl_improved.ipynb": executed("02"),
-        results / "paper/seed_0/case_1/notebooks/02_offline_irl_printed.ipynb": executed("02 printed"),
-        results / "paper/seed_0/case_1/notebooks/02_offline_irl_whole_return.ipynb": executed("02 of a trial"),
-        results / "paper/seed_0/case_3/notebooks/01_demonstrations.ipynb": executed("01"),
-        results / "paper/seed_0/case_3/notebooks/.01_demonstrations.123.ipynb": executed("what a killed run left"),
-        results / "paper/seed_0/notebooks/07_your_own_process.ipynb": executed("07"),
-        results / "paper/seed_1/case_3/notebooks/01_demonstrations.ipynb": executed("01 of another seed"),
-        tmp_path / "README.md": README,
-        tmp_path / "docs/running.md": RUNNING,
-    }
-    for path, text in files.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    places = {"PROJECT": tmp_path, "LATEST": latest, "REFERENCE": tmp_path / "reports/reference", "RESULTS": results}
-    for name, value in places.items():
-        monkeypatch.setattr(publish, name, value)
-    monkeypatch.setattr(publish, "code_revision", lambda _: REVISION)
-    return tmp_path
-
-
-def test_publishing_copies_the_report_and_the_first_seed_s_notebooks_and_writes_the_numbers_into_readme(project):
-    old = project / "reports/reference/old.txt"
-    old.parent.mkdir()
-    old.write_text("of the run before")
-    (old.parent / "reliability.md").write_text("of make torture")
-    assert publish.main([]) == 0
-    reference = project / "reports/reference"
-    found = {str(path.relative_to(reference)) for path in reference.rglob("*") if path.is_file()}
-    of_the_report = (path for path in (project / "reports/latest").rglob("*") if path.is_file())
-    assert found == {
-        *(str(path.relative_to(project / "reports/latest")) for path in of_the_report),
-        *("notebooks/02_offline_irl_case_1.ipynb", "notebooks/02_offline_irl_printed_case_1.ipynb"),
-        *("notebooks/01_demonstrations_case_3.ipynb", "notebooks/07_your_own_process.ipynb", "reliability.md"),
-    }
-    assert json.loads((reference / "notebooks/01_demonstrations_case_3.ipynb").read_text())["metadata"] == {"what": "01"}
-    assert sorted(path.name for path in (project / "reports").iterdir()) == ["latest", "reference"]
-
-    lines = (project / "README.md").read_text(encoding="utf-8").splitlines()
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith(("| I ", "| II "))]
-    assert rows[0] == ["I", "1.0 % [0.9, 1.2]", "10.0 %", "20.0 % [15.0, 31.0]", "40.0 %", "95.1 %"]
-    assert rows[1] == ["II", "2.0 %", "13.7 %", "3.0 % [2.0, 4.0]", "–", "–"]
-    assert "(ours: medians and 95 % bootstrap intervals of the median over 20 seeds)" in lines
-    assert "and all that `make evidence` runs for 2 seeds 2.0 hours. With two cores, two stages run at a time." in lines
-    running = (project / "docs/running.md").read_text(encoding="utf-8").splitlines()
-    assert any("offline_improved" in line and " 20 " in line for line in running)
-    kept = [line for line in lines if line in README.splitlines()]
-    assert kept == README.replace("old\n", "").splitlines()
-
-
-@pytest.fixture
-def published(project):
-    """The same with an older reference, and a function that tells what every file holds."""
-    reference = project / "reports/reference"
-    (reference / "tables").mkdir(parents=True)
-    (reference / "provenance.json").write_text(json.dumps(GOOD | {"seeds": [0]}))
-
-    def content():
-        return {path: path.read_bytes() for path in project.rglob("*") if path.is_file()}
-
-    return project, content
-
-
-def test_evidence_like_that_of_the_published_report_is_accepted_and_its_gaps_to_the_optimum_are_written(published):
-    project, _ = published
-    rows = ["controller,I,III", "PID (demonstrator),2.0,4.5", 'offset-free MPC,"6.0 [5.0, 7.0]",8.0', "programme on x,0.0,0.0"]
-    for folder, table in product(("reference", "latest"), ("claims.csv", "limits_gaps.csv")):
-        (project / "reports" / folder / "tables" / table).write_text("\n".join([*rows, ""]))
-    assert publish.main([]) == 0
-    lines = (project / "README.md").read_text(encoding="utf-8").splitlines()
-    first = lines.index("<!-- limits: c -->") + 1
-    table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[first : lines.index("<!-- /limits -->")]]
-    assert table[0] == ["controller", "case I, %", "case III, %"]
-    assert table[2:] == [["PID (demonstrator)", "2.0", "4.5"], ["offset-free MPC", "6.0 [5.0, 7.0]", "8.0"]]
-
-
-def refused(capsys, status):
-    """The one sentence with which publishing ends."""
-    assert publish.main([]) == status
-    said = capsys.readouterr().err
-    assert said.startswith("error: ")
-    assert said.count("\n") == 1
-    return said
-
-
 COPY, LATEST = "results/paper/seed_0/case_1/notebooks/02_offline_irl_printed", "reports/latest"
 NOWHERE = "nowhere"  # a link to it cannot be copied
 FAULTS = {  # what is written, None for a file that is missing; the exit status, and what is said
@@ -173,26 +52,118 @@ FAULTS = {  # what is written, None for a file that is missing; the exit status,
 }
 
 
+@pytest.mark.parametrize(("changes", "reference", "revision", "says"), REFUSED.values(), ids=REFUSED)
+def test_only_a_clean_run_at_paper_scale_is_accepted(changes, reference, revision, says):
+    check(GOOD, {"seeds": [0, 1]}, REVISION)
+    with pytest.raises(PublishError, match=rf"\A.*{re.escape(says)}.*\Z"):  # in one line
+        check(GOOD | changes, reference, revision)
+
+
+@pytest.fixture
+def project(monkeypatch, tmp_path):
+    """A project with a finished run."""
+    latest, results = tmp_path / "reports/latest", tmp_path / "results"
+    parts = ("report.html", "report.pdf", "report.md", "figures/figure_3.png", "tables/table_2.csv", "comparison.csv")
+    files = {part: part for part in parts} | {"tables/gaps.csv": GAPS, "provenance.json": json.dumps(GOOD)}
+    files["tables/time.csv"] = "case,stage,seconds\n1,demonstrations,2.4\n2,demonstrations,3.6\n1,offline_improved,20.2\n"
+    files["seeds.csv"] = "case,seed,stage,metric,value\n1,0,offline,feature_gap,0.2\n"
+    copies = (  # also of a trial, of a killed run, and of another seed
+        *("reports/latest/notebooks/05_report", "results/paper/seed_0/notebooks/07_your_own_process"),
+        *(f"results/paper/seed_0/case_1/notebooks/02_offline_irl_{variant}" for variant in ("improved", "printed", "whole_return")),
+        *(f"results/paper/seed_0/case_3/notebooks/{name}" for name in ("01_demonstrations", ".01_demonstrations.123")),
+        "results/paper/seed_1/case_3/notebooks/01_demonstrations",
+    )
+    pages = {latest / name: text for name, text in files.items()}
+    pages |= {tmp_path / f"{copy}.ipynb": json.dumps({"cells": [], "metadata": {"what": copy}}) for copy in copies}
+    pages |= {tmp_path / "README.md": README, tmp_path / "docs/running.md": RUNNING}
+    for path, text in pages.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    places = {"PROJECT": tmp_path, "LATEST": latest, "REFERENCE": tmp_path / "reports/reference", "RESULTS": results}
+    for name, value in (places | {"code_revision": lambda _: REVISION}).items():
+        monkeypatch.setattr(publish, name, value)
+    return tmp_path
+
+
+def cells(line):
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_publishing_copies_the_report_and_the_first_seed_s_notebooks_and_writes_the_numbers_into_readme(project):
+    old = project / "reports/reference/old.txt"
+    old.parent.mkdir()
+    old.write_text("of the run before")
+    (old.parent / "reliability.md").write_text("of make torture")
+    assert publish.main([]) == 0
+    reference, latest = project / "reports/reference", project / "reports/latest"
+    found, report = ({str(path.relative_to(of)) for path in of.rglob("*") if path.is_file()} for of in (reference, latest))
+    copies = {"02_offline_irl_case_1", "02_offline_irl_printed_case_1", "01_demonstrations_case_3", "07_your_own_process"}
+    assert found == {*report, *(f"notebooks/{name}.ipynb" for name in copies), "reliability.md"}
+    copy = json.loads((reference / "notebooks/01_demonstrations_case_3.ipynb").read_text())
+    assert copy["metadata"]["what"] == "results/paper/seed_0/case_3/notebooks/01_demonstrations"
+    assert sorted(path.name for path in (project / "reports").iterdir()) == ["latest", "reference"]
+
+    lines = (project / "README.md").read_text(encoding="utf-8").splitlines()
+    first, second = (cells(line) for line in lines if line.startswith(("| I ", "| II ")))
+    assert first == ["I", "1.0 % [0.9, 1.2]", "10.0 %", "20.0 % [15.0, 31.0]", "40.0 %", "95.1 %"]
+    assert second == ["II", "2.0 %", "13.7 %", "3.0 % [2.0, 4.0]", "–", "–"]
+    assert "(ours: medians and 95 % bootstrap intervals of the median over 20 seeds)" in lines
+    assert "and all that `make evidence` runs for 2 seeds 2.0 hours. With two cores, two stages run at a time." in lines
+    running = (project / "docs/running.md").read_text(encoding="utf-8").splitlines()
+    assert any("offline_improved" in line and " 20 " in line for line in running)
+    assert [line for line in lines if line in README.splitlines()] == README.replace("old\n", "").splitlines()
+
+
+@pytest.fixture
+def published(project):
+    """The same with an older reference."""
+    (project / "reports/reference/tables").mkdir(parents=True)
+    (project / "reports/reference/provenance.json").write_text(json.dumps(GOOD | {"seeds": [0]}))
+    return project
+
+
+def content(project):
+    return {path: path.read_bytes() for path in project.rglob("*") if path.is_file()}
+
+
+def test_evidence_like_that_of_the_published_report_is_accepted_and_its_gaps_to_the_optimum_are_written(published):
+    rows = ["controller,I,III", "PID (demonstrator),2.0,4.5", 'offset-free MPC,"6.0 [5.0, 7.0]",8.0', "programme on x,0.0,0.0"]
+    for folder, table in product(("reference", "latest"), ("claims.csv", "limits_gaps.csv")):
+        (published / "reports" / folder / "tables" / table).write_text("\n".join([*rows, ""]))
+    assert publish.main([]) == 0
+    lines = (published / "README.md").read_text(encoding="utf-8").splitlines()
+    first = lines.index("<!-- limits: c -->") + 1
+    names, _, *table = map(cells, lines[first : lines.index("<!-- /limits -->")])
+    assert names == ["controller", "case I, %", "case III, %"]
+    assert table == [["PID (demonstrator)", "2.0", "4.5"], ["offset-free MPC", "6.0 [5.0, 7.0]", "8.0"]]
+
+
+def refused(capsys, status):
+    """The one sentence with which publishing ends."""
+    assert publish.main([]) == status
+    said = capsys.readouterr().err
+    assert re.fullmatch("error: .*\n", said)
+    return said
+
+
 @pytest.mark.parametrize(("path", "text", "status", "says"), FAULTS.values(), ids=FAULTS)
 def test_a_run_that_is_refused_or_lacks_a_part_ends_in_a_sentence_and_changes_nothing(published, capsys, path, text, status, says):
-    project, content = published
     if text is None:
-        (project / path).rename(project / "elsewhere")
+        (published / path).rename(published / "elsewhere")
     elif text == NOWHERE:
-        (project / path).symlink_to(text)
+        (published / path).symlink_to(text)
     else:
-        (project / path).write_text(text)
-    before = content()
+        (published / path).write_text(text)
+    before = content(published)
     assert says in refused(capsys, status)
-    assert content() == before
-    assert sorted(found.name for found in (project / "reports").iterdir()) == ["latest", "reference"]
+    assert content(published) == before
+    assert sorted(found.name for found in (published / "reports").iterdir()) == ["latest", "reference"]
 
 
 @pytest.mark.parametrize("left", ["partial", "partial and reference aside", "reference aside, new one in place"])
 def test_a_kill_at_any_moment_loses_no_reference(published, capsys, left):
-    project, content = published
-    reports = project / "reports"
-    expected = content()
+    (published / "reports/latest/provenance.json").write_text(json.dumps(GOOD | {"scale": "smoke"}))  # so that nothing is published
+    reports, expected = published / "reports", content(published)
     if "partial" in left:
         (reports / ".reference.partial").mkdir()
         (reports / ".reference.partial/report.html").touch()
@@ -201,15 +172,12 @@ def test_a_kill_at_any_moment_loses_no_reference(published, capsys, left):
     elif left.startswith("reference"):
         (reports / ".reference.old").mkdir()
         (reports / ".reference.old/provenance.json").touch()
-    (project / "reports/latest/provenance.json").rename(project / "provenance.json")  # so that nothing is published
     refused(capsys, 2)
-    (project / "provenance.json").rename(project / "reports/latest/provenance.json")
-    assert content() == expected
+    assert content(published) == expected
 
 
 def test_a_reference_that_cannot_be_replaced_stays(published, capsys, monkeypatch):
-    _, content = published
-    before, rename = content(), Path.rename
+    before, rename = content(published), Path.rename
 
     def refusing(path, target):
         if path.name == ".reference.partial":
@@ -218,7 +186,7 @@ def test_a_reference_that_cannot_be_replaced_stays(published, capsys, monkeypatc
 
     monkeypatch.setattr(Path, "rename", refusing)
     assert "No space left on device" in refused(capsys, 1)
-    assert content() == before
+    assert content(published) == before
 
 
 def test_git_sees_nothing_of_what_a_kill_leaves_beside_the_reference():
@@ -230,14 +198,12 @@ def test_git_sees_nothing_of_what_a_kill_leaves_beside_the_reference():
     assert ignored.stdout.split() == left
 
 
-@pytest.mark.parametrize(
-    ("link", "leads"),
-    [
-        ("[code](../src/helpers/x.py)", "[code](../../../src/helpers/x.py)"),
-        ("[next](03_online_improvement.ipynb)", "[next](../../../notebooks/03_online_improvement.ipynb)"),
-        ("[paper](https://doi.org/10.1002/x)", "[paper](https://doi.org/10.1002/x)"),
-    ],
-)
+LINKS = {"[code](../src/helpers/x.py)": "[code](../../../src/helpers/x.py)"}
+LINKS |= {"[next](03_online_improvement.ipynb)": "[next](../../../notebooks/03_online_improvement.ipynb)"}
+LINKS |= {"[paper](https://doi.org/10.1002/x)": "[paper](https://doi.org/10.1002/x)"}
+
+
+@pytest.mark.parametrize(("link", "leads"), LINKS.items())
 def test_an_executed_copy_leads_where_the_notebook_led_and_holds_a_table_once(link, leads):
     data = {"text/html": "<table>", "text/plain": "a table"}
     cells = [{"source": f"See {link}, and {link}."}, {"source": "", "outputs": [{"data": data}, {"data": {"text/plain": "7"}}]}]

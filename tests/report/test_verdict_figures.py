@@ -15,13 +15,11 @@ VERDICTS = {"expert": "fitted", "policy": "differs", "alpha": "cannot tell"}
 
 def compared(cases=(1, 2)):
     """Ours is a tenth above the published number, the interval reaches from half of it to twice it."""
-    rows = []
-    for case, row, (index, feature) in product(cases, VERDICTS, enumerate(NAMES)):
-        published = -2.0 - index
-        numbers = {"published": published, "reproduced": 0.9 * published, "pred_low": 2 * published, "pred_high": published / 2}
-        verdict = "match" if feature == "T-II" else VERDICTS[row]
-        rows.append({"table": case + 1, "case": case, "row": row, "feature": feature, **numbers, "verdict": verdict})
-    return pd.DataFrame(rows)
+    table = pd.DataFrame(product(cases, VERDICTS, NAMES), columns=["case", "row", "feature"])
+    published = -2.0 - table["feature"].map(NAMES.index)
+    table = table.assign(table=table["case"] + 1, published=published, reproduced=0.9 * published)
+    verdicts = table["row"].map(VERDICTS).mask(table["feature"] == "T-II", "match")
+    return table.assign(pred_low=2 * published, pred_high=published / 2, verdict=verdicts)
 
 
 def test_every_published_number_is_in_the_picture_with_ours_relative_to_it():
@@ -32,8 +30,7 @@ def test_every_published_number_is_in_the_picture_with_ours_relative_to_it():
         assert set(points) == {f"{row} {name}" for row, name in product(VERDICTS, NAMES)}
         assert [line.get_xdata()[0] for line in points.values()] == pytest.approx([10.0] * 12)
         heights = [line.get_ydata()[0] for line in points.values()]
-        assert heights == sorted(heights, reverse=True)
-        assert len(set(heights)) == 12
+        assert heights == sorted({*heights}, reverse=True)
         spans = [line.get_xdata() for line in axes.lines if len(line.get_xdata()) == 2 and line.get_marker() == "None"][:12]
         np.testing.assert_allclose(spans, [[-100.0, 50.0]] * 12)
         for label, line in points.items():

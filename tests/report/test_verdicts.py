@@ -19,9 +19,7 @@ def folder(tmp_path):
     seeds = pd.read_csv(REFERENCE / "seeds.csv").query("case == 1 and stage in ('expert', 'offline')")
     seeds.to_csv(tmp_path / "seeds.csv", index=False)
     (tmp_path / "tables").mkdir()
-    rows = [
-        [1, f"experiments/{run}/objective_x", *(less + seed for seed in range(6))] for run, less in (("hot", 2), ("scratch", 1))
-    ]
+    rows = [[1, f"experiments/{run}/objective_x", *range(least, least + 6)] for run, least in (("hot", 2), ("scratch", 1))]
     values = pd.DataFrame(rows, columns=["case", "quantity", *range(6)])
     values.to_csv(tmp_path / "tables/claims_seeds.csv", index=False)
     for name, table in recomputed(tmp_path, PARAMS).items():

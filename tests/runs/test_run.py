@@ -17,18 +17,31 @@ import pytest
 from helpers.runs import identity, run
 from helpers.runs.artifacts import load_stage
 from helpers.runs.sources import PROJECT, code_behind
+from torture.runs import Place
 
 SLOW = pytest.mark.torture
-PAPERMILL = [sys.executable, "-m", "papermill", "--no-progress-bar"]
-
-
-def text_of(path):
-    """All the text of an executed notebook, in which its pictures would only match by accident."""
-    return re.sub(r'"image/png": "[^"]*"', "", Path(path).read_text(encoding="utf-8"))
+SUMMARIES = {"smoke": "\n1 notebook(s) failed; ", "huge": "\nNo notebook failed, what went wrong stands above; "}
+ADDED = ""  # in place of words to replace: a line at the beginning
+WRONG_ARGUMENTS = {  # the notebook, the copy and parameters; those of a notebook by hand are in test_session.py
+    "an unknown case": (["01_demonstrations", "copies/x.ipynb", "-p", "case", "9"], "case_9.yaml"),
+    "a strange digit": (["01_demonstrations", "copies/x.ipynb", "-p", "seed", "²"], "'seed'"),
+    "an unknown notebook": (["06_oracle", "copies/x.ipynb"], "06_oracle.ipynb"),
+    "a notebook elsewhere": (["../notebooks/01_demonstrations", "copies/x.ipynb"], "there is no such notebook"),
+    "a copy among the code": (["05_report", str(PROJECT / "results/../src/x.ipynb")], "'output'"),
+    "results among the code": (["01_demonstrations", "x.ipynb", "-p", "output_root", str(PROJECT / "src")], "'output_root'"),
+}
 
 
 def everything_below(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def change(path, old, new):
+    """Change a file in one place; the text before."""
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    return text
 
 
 @pytest.fixture
@@ -78,33 +91,19 @@ def test_a_notebook_runs_from_any_directory_and_leaves_no_trace_of_the_machine(h
     stage = load_stage(here / "out/smoke/seed_5/case_2/demonstrations", "notebook 01")
     assert {"notebook": "01_demonstrations", "case": 2, "seed": 5, "scale": "smoke"}.items() <= stage.record.items()
     assert everything_below(here / "copies") == ["01.ipynb"]
-    copy = nbformat.read(here / "copies/01.ipynb", as_version=4)
-    assert "papermill" not in copy.metadata
-    for cell in copy.cells:
-        assert not {"papermill", "execution"} & set(cell.metadata)
-        assert cell.cell_type == "markdown" or cell.execution_count
-    for place in (here, PROJECT, Path.home(), "ipykernel"):
-        assert f"{place}/" not in text_of(here / "copies/01.ipynb")
-
-
-WRONG_ARGUMENTS = {  # the notebook, the copy and parameters; those of a notebook by hand are in test_session.py
-    "an unknown case": (["01_demonstrations", "copies/x.ipynb", "-p", "case", "9"], "case_9.yaml"),
-    "a strange digit": (["01_demonstrations", "copies/x.ipynb", "-p", "seed", "²"], "'seed'"),
-    "an unknown notebook": (["06_oracle", "copies/x.ipynb"], "06_oracle.ipynb"),
-    "a notebook elsewhere": (["../notebooks/01_demonstrations", "copies/x.ipynb"], "there is no such notebook"),
-    "a copy among the code": (["05_report", str(PROJECT / "results/../src/x.ipynb")], "'output'"),
-    "results among the code": (["01_demonstrations", "x.ipynb", "-p", "output_root", str(PROJECT / "src")], "'output_root'"),
-}
+    copy = nbformat.read("copies/01.ipynb", as_version=4)
+    assert not {"papermill", "execution"} & {*copy.metadata, *(name for cell in copy.cells for name in cell.metadata)}
+    assert all(cell.cell_type == "markdown" or cell.execution_count for cell in copy.cells)
+    # Of an executed notebook all text; in its pictures the names would only match by accident.
+    text = re.sub(r'"image/png": "[^"]*"', "", Path("copies/01.ipynb").read_text(encoding="utf-8"))
+    assert [place for place in (here, PROJECT, Path.home(), "ipykernel") if f"{place}/" in text] == []
 
 
 @pytest.mark.parametrize(("arguments", "says"), WRONG_ARGUMENTS.values(), ids=WRONG_ARGUMENTS)
 def test_wrong_arguments_end_at_once_with_nothing_run_and_nothing_written(monkeypatch, here, capfd, arguments, says):
     monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, **__: pytest.fail("the notebook was run"))
     assert run.main(arguments) == 2
-    said = capfd.readouterr().err
-    assert said.startswith("error: ")
-    assert said.count("\n") == 1
-    assert says in said
+    assert re.fullmatch(f"error: .*{re.escape(says)}.*\n", capfd.readouterr().err)
     assert everything_below(here) == []
 
 
@@ -121,14 +120,13 @@ def test_roots_are_those_of_the_callers_directory(monkeypatch, here):
 def test_a_damaged_parameter_file_is_marked_for_the_summary_and_the_older_copy_stays(monkeypatch, here, capfd):
     monkeypatch.setattr(run.papermill, "execute_notebook", lambda *_, **__: None)
     params = shutil.copytree(PROJECT / "params", here / "params") / "process.yaml"
-    good = params.read_text(encoding="utf-8")
-    params.write_text("extra: 1\n" + good, encoding="utf-8")
+    good = change(params, ADDED, "extra: 1\n")
     (here / "01.ipynb").write_text("an older run")
     arguments = ["01_demonstrations", "01.ipynb", "-p", "case", "2", "-p", "params_root", "params"]
     assert run.main(arguments) == 2
-    said = capfd.readouterr().err
-    assert said.startswith(f"error: 01_demonstrations case=2: {params}: ")
-    assert said == f"error: {(here / '01.failed').read_text()}"
+    said = (here / "01.failed").read_text()
+    assert said.startswith(f"01_demonstrations case=2: {params}: ")
+    assert capfd.readouterr().err == f"error: {said}"
     assert (here / "01.ipynb").read_text() == "an older run"
     params.write_text(good, encoding="utf-8")
     assert run.main(arguments) == 0
@@ -157,8 +155,8 @@ def test_a_notebook_that_raises_keeps_its_traceback_in_place_of_an_older_copy_an
 @pytest.mark.torture
 def test_plain_papermill_refuses_a_misspelt_parameter(here):
     """papermill itself only warns; the notebook's first cell ends the run."""
-    notebook = PROJECT / "notebooks/01_demonstrations.ipynb"
-    command = [*PAPERMILL, notebook, "01.ipynb", "-p", "case", "1", "-p", "sed", "3", "-p", "output_root", str(here / "out")]
+    given = ["-p", "case", "1", "-p", "sed", "3", "-p", "output_root", str(here / "out")]
+    command = [sys.executable, "-m", "papermill", PROJECT / "notebooks/01_demonstrations.ipynb", "01.ipynb", *given]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "notebooks/01_demonstrations.ipynb: there is no parameter 'sed'; the parameters are case, seed" in done.stderr
@@ -168,13 +166,7 @@ def test_plain_papermill_refuses_a_misspelt_parameter(here):
 @pytest.fixture
 def source(tmp_path):
     """A copy of what results are made from and of what plans them, to be changed."""
-    copy = tmp_path / "copy"
-    for part in ("params", "profiles", "rules", "src/helpers", "reports/template"):
-        shutil.copytree(PROJECT / part, copy / part, ignore=shutil.ignore_patterns("__pycache__"))
-    (copy / "notebooks").mkdir()
-    for path in (PROJECT / "Snakefile", *(PROJECT / "notebooks").glob("*.ipynb")):
-        shutil.copy(path, copy / path.relative_to(PROJECT))
-    return copy
+    return Place.copied(tmp_path / "copy").project
 
 
 @pytest.fixture
@@ -184,45 +176,39 @@ def plan(source):
     def dry_run(*targets, **config):
         settings = [f"{name}={value}" for name, value in ({"scale": "smoke", "reports": "report"} | config).items()]
         snakemake = [sys.executable, "-m", "snakemake", "-n", "--profile", "profiles/local", "--cores", "1", "--nolock"]
-        done = subprocess.run(
-            [*snakemake, "--config", *settings, "--", *targets], cwd=source, capture_output=True, text=True, check=False
-        )
+        command = [*snakemake, "--config", *settings, "--", *targets]
+        done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
-        counts = dict(re.findall(r"^(\w+) +(\d+)$", (done.stdout + done.stderr), re.MULTILINE))
-        return {rule: int(count) for rule, count in counts.items() if rule not in ("all", "total")}
+        counts = re.findall(r"^(\w+) +(\d+)$", done.stdout + done.stderr, re.MULTILINE)
+        return {rule: int(count) for rule, count in counts if rule not in ("all", "total")}
 
-    dry_run.folder = source
     return dry_run
 
 
 @pytest.fixture
-def finished(plan):
+def finished(plan, source):
     """The same after a finished run, whose results were made from what the copy holds."""
-    copy = plan.folder
-    shutil.copytree(PROJECT / "notebooks/inputs", copy / "results")
-    (copy / "report").mkdir()
-    for path in (copy / "results").rglob("record.json"):
+    shutil.copytree(PROJECT / "notebooks/inputs", source / "results")
+    (source / "report").mkdir()
+    for path in (source / "results").rglob("record.json"):
         record = json.loads(path.read_text(encoding="utf-8"))
         run = [record[name] for name in ("notebook", "scale", "case", "variant")]
-        record["inputs"] = identity.inputs(run[0], copy / "params", *run[1:], copy)
+        record["inputs"] = identity.inputs(run[0], source / "params", *run[1:], source)
         path.write_text(json.dumps(record), encoding="utf-8")
-    made_from = identity.inputs("05_report", copy / "params", "smoke", project=copy)
-    (copy / "report/provenance.json").write_text(json.dumps({"inputs": made_from}), encoding="utf-8")
-    (copy / "report/report.html").touch()
-    # As stages finish one after the other, then the report.
-    order = {"record.json": 2000, "report.html": 3000, "provenance.json": 3000}
-    stages = ["demonstrations", "offline", "transfer", "online"]
-    for path in copy.rglob("*"):
-        after = next((number for number, stage in enumerate(stages) if path.parent.name.startswith(stage)), 0)
-        time = order.get(path.name, 1000) + after
-        os.utime(path, (time, time))
+    made_from = identity.inputs("05_report", source / "params", "smoke", project=source)
+    (source / "report/provenance.json").write_text(json.dumps({"inputs": made_from}), encoding="utf-8")
+    (source / "report/report.html").touch()
+    in_order = ["*", "record.json", "offline_*/record.json", "transfer_*/record.json", "online_*/record.json", "report/*.*"]
+    for time, pattern in enumerate(in_order, 1000):  # as stages finish one after the other, then the report
+        for path in source.rglob(pattern):
+            os.utime(path, (time, time))
     return plan
 
 
+IMPROVED_AND_PRINTED = [(1, "improved"), (1, "printed"), (2, "improved"), (2, "printed"), (3, "improved")]
 RESULTS = {  # by rule of the Snakefile: the notebook, case and variant of each of its results
     "demonstrations": [("01_demonstrations", case, "improved") for case in (1, 2, 3)],
-    "offline": [("02_offline_irl", case, variant) for case in (1, 2) for variant in ("improved", "printed")]
-    + [("02_offline_irl", 3, "improved")],
+    "offline": [("02_offline_irl", *run) for run in IMPROVED_AND_PRINTED],
     "online": [("03_online_improvement", case, "improved") for case in (1, 2)],
     "transfer": [("04_knowledge_transfer", 3, "improved")],
     "transfer_alone": [("04_knowledge_transfer", 3, "printed")],
@@ -232,45 +218,32 @@ ONE_SEED = {rule: len(results) for rule, results in RESULTS.items()}
 LEARNT = {rule: number for rule, number in ONE_SEED.items() if rule != "report"}
 ONLINE = {rule: number for rule, number in ONE_SEED.items() if rule not in ("demonstrations", "offline")}
 STAGE = "results/smoke/seed_0/case_{}/{}/record.json"
+NEEDED = [
+    ([], 1, ONE_SEED),
+    ([STAGE.format(3, "transfer_printed")], 1, {"demonstrations": 2, "offline": 1, "transfer_alone": 1}),
+    pytest.param([], 2, {rule: 2 * number for rule, number in LEARNT.items()} | {"report": 1}, marks=SLOW),
+    pytest.param([STAGE.format(2, "demonstrations")], 1, {"demonstrations": 1}, marks=SLOW),
+    pytest.param([STAGE.format(2, "online_improved")], 1, {"demonstrations": 1, "offline": 1, "online": 1}, marks=SLOW),
+    pytest.param([STAGE.format(3, "online_improved")], 1, {"demonstrations": 2, "offline": 1, "transfer": 1}, marks=SLOW),
+]
+NAMES = ["all", "transfer alone", "two seeds", "recording", "online", "transfer"]
 
 
-@pytest.mark.parametrize(
-    ("targets", "n_seeds", "jobs"),
-    [
-        ([], 1, ONE_SEED),
-        ([STAGE.format(3, "transfer_printed")], 1, {"demonstrations": 2, "offline": 1, "transfer_alone": 1}),
-        pytest.param([], 2, {rule: 2 * number for rule, number in LEARNT.items()} | {"report": 1}, marks=SLOW),
-        pytest.param([STAGE.format(2, "demonstrations")], 1, {"demonstrations": 1}, marks=SLOW),
-        pytest.param([STAGE.format(2, "online_improved")], 1, {"demonstrations": 1, "offline": 1, "online": 1}, marks=SLOW),
-        pytest.param([STAGE.format(3, "online_improved")], 1, {"demonstrations": 2, "offline": 1, "transfer": 1}, marks=SLOW),
-    ],
-    ids=["all", "transfer alone", "two seeds", "recording", "online", "transfer"],
-)
+@pytest.mark.parametrize(("targets", "n_seeds", "jobs"), NEEDED, ids=NAMES)
 def test_a_run_needs_each_stage_of_each_seed_and_a_stage_alone_only_what_it_reads(plan, targets, n_seeds, jobs):
     assert plan(*targets, seeds=n_seeds) == jobs
 
 
 @pytest.mark.torture
-def test_finished_stages_are_skipped_and_what_is_damaged_or_gone_is_made_again(finished):
+def test_finished_stages_are_skipped_and_what_is_damaged_or_gone_is_made_again(finished, source):
     assert finished() == {}
-    record = finished.folder / STAGE.format(2, "online_improved")
+    record = source / STAGE.format(2, "online_improved")
     record.write_text("{")
     assert finished() == {"online": 1, "report": 1}
     record.unlink()
-    (finished.folder / "report/report.html").unlink()
+    (source / "report/report.html").unlink()
     assert finished() == {"online": 1, "report": 1}
     assert finished(missing=1) == {"report": 1}  # of the seeds that are whole, only when asked
-
-
-ADDED = None  # in place of words to replace: a line at the end
-
-
-def edited(text, old, new):
-    """The text with one change."""
-    if old is ADDED:
-        return text + new
-    assert old in text
-    return text.replace(old, new, 1)
 
 
 EDITS = [
@@ -290,6 +263,11 @@ EDITS = [
     ("src/helpers/report/report.py", "RUNNERS = (", "RUNNERS = (*(),", {"report": 1}),
     ("src/helpers/report/figures.py", "MUTED = ", "MUTED: str = ", {"report": 1}),
 ]
+RUN_AGAIN = [
+    EDITS[0],
+    pytest.param("src/helpers/learning/algorithm_2.py", "(self.mean)", "(+self.mean)", ONE_SEED, marks=SLOW),
+    pytest.param("reports/template/report.md.jinja", "# The reproduction", "# A reproduction", {"report": 1}, marks=SLOW),
+]
 
 
 def test_a_change_makes_exactly_the_results_stale_that_are_made_from_it(monkeypatch, source):
@@ -302,61 +280,45 @@ def test_a_change_makes_exactly_the_results_stale_that_are_made_from_it(monkeypa
 
     before = made_from()
     for changed, old, new, stale in EDITS:
-        path = source / changed
-        text = path.read_text(encoding="utf-8")
-        path.write_text(edited(text, old, new), encoding="utf-8")
+        text = change(source / changed, old, new)
         after = made_from()
         assert Counter(result[0] for result in before if after[result] != before[result]) == stale, (changed, new)
-        path.write_text(text, encoding="utf-8")
+        (source / changed).write_text(text, encoding="utf-8")
 
 
-@pytest.mark.parametrize(
-    ("changed", "old", "new", "jobs"),
-    [
-        EDITS[0],
-        pytest.param("src/helpers/learning/algorithm_2.py", "(self.mean)", "(+self.mean)", ONE_SEED, marks=SLOW),
-        pytest.param("reports/template/report.md.jinja", "# The reproduction", "# A reproduction", {"report": 1}, marks=SLOW),
-    ],
-)
-def test_what_is_stale_is_run_again_with_all_that_read_it(finished, changed, old, new, jobs):
-    path = finished.folder / changed
-    before = path.read_text(encoding="utf-8")
-    path.write_text(edited(before, old, new), encoding="utf-8")
+@pytest.mark.parametrize(("changed", "old", "new", "jobs"), RUN_AGAIN)
+def test_what_is_stale_is_run_again_with_all_that_read_it(finished, source, changed, old, new, jobs):
+    before = change(source / changed, old, new)
     assert finished() == jobs
-    path.write_text(before, encoding="utf-8")
+    (source / changed).write_text(before, encoding="utf-8")
     if not changed.startswith("reports/template"):  # of which Snakemake looks at the time
         assert finished() == {}  # whatever the times of the files
 
 
 @pytest.mark.torture
-def test_what_make_bench_wrote_last_goes_into_the_report_and_results_that_were_removed_are_made_again(finished):
-    folder = finished.folder / "reports/reference/benchmarks"
+def test_what_make_bench_wrote_last_goes_into_the_report_and_results_that_were_removed_are_made_again(finished, source):
+    folder = source / "reports/reference/benchmarks"
     folder.mkdir(parents=True)
     for name in ("summary.md", "machine.md", "scaling.svg"):
         (folder / name).touch()
         assert finished() == {"report": 1}
         os.utime(folder / name, (1000, 1000))
         assert finished() == {}
-    shutil.rmtree(finished.folder / "results")
-    path = finished.folder / "src/helpers/report/report.py"
-    path.write_text(edited(path.read_text(encoding="utf-8"), "RUNNERS = (", "RUNNERS = (*(),"), encoding="utf-8")
+    shutil.rmtree(source / "results")
+    change(source / "src/helpers/report/report.py", "RUNNERS = (", "RUNNERS = (*(),")
     assert finished() == ONE_SEED  # whatever else has changed
 
 
 @pytest.mark.torture
-@pytest.mark.parametrize(
-    ("scale", "says"),
-    [("smoke", "\n1 notebook(s) failed; "), ("huge", "\nNo notebook failed, what went wrong stands above; ")],
-    ids=["a parameter file", "the command"],
-)
-def test_the_summary_tells_what_was_refused_before_it_ran(plan, scale, says):
-    path = plan.folder / "params/case_2.yaml"
+@pytest.mark.parametrize(("scale", "says"), SUMMARIES.items())
+def test_the_summary_tells_what_was_refused_before_it_ran(plan, source, scale, says):
+    """In a parameter file, or in the command."""
     if scale == "smoke":
-        path.write_text(path.read_text(encoding="utf-8") + "extra: 1\n", encoding="utf-8")
+        change(source / "params/case_2.yaml", ADDED, "extra: 1\n")
     command = [sys.executable, "-m", "snakemake", "--profile", "profiles/local", "--cores", "1", "--config", f"scale={scale}"]
     target = f"results/{scale}/seed_0/case_2/demonstrations/record.json"
-    environment = {**os.environ, "PYTHONPATH": str(plan.folder / "src")}
-    done = subprocess.run([*command, "--", target], cwd=plan.folder, env=environment, capture_output=True, text=True, check=False)
+    environment = {**os.environ, "PYTHONPATH": str(source / "src")}
+    done = subprocess.run([*command, "--", target], cwd=source, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert says in done.stderr
     said = done.stderr[done.stderr.index(says) :]

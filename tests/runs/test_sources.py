@@ -9,11 +9,9 @@ import pytest
 
 from helpers.runs import sources
 
-IMPORTS = """
-import sys
-{code}
-print("\\n".join(sorted(name for name in sys.modules if name.startswith("helpers."))))
-"""
+TELL = "\nimport sys\nprint(*(name for name in sys.modules if name.startswith('helpers.')))"
+LEARNING, REPORT = {"helpers.learning.algorithm_2", "helpers.runs.session"}, {"helpers.report.collection"}
+NOTEBOOKS = [("02_offline_irl", LEARNING), pytest.param("05_report", REPORT, marks=pytest.mark.torture)]
 
 
 def import_statements(notebook):
@@ -29,16 +27,9 @@ def names_behind(notebook):
     return {".".join(path.parts).removesuffix(".__init__") for path in paths}
 
 
-@pytest.mark.parametrize(
-    ("notebook", "among"),
-    [
-        ("02_offline_irl", {"helpers.learning.algorithm_2", "helpers.runs.session"}),
-        pytest.param("05_report", {"helpers.report.collection"}, marks=pytest.mark.torture),
-    ],
-)
+@pytest.mark.parametrize(("notebook", "among"), NOTEBOOKS)
 def test_every_module_that_python_imports_is_found_but_for_what_only_shows(notebook, among):
-    code = IMPORTS.format(code=import_statements(notebook))
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    run = subprocess.run([sys.executable, "-c", import_statements(notebook) + TELL], capture_output=True, text=True, check=True)
     imported = set(run.stdout.split())
     assert {"helpers.settings.paper"} | among < imported
     shown = {name for name in imported if name.startswith("helpers.report")}
@@ -54,9 +45,7 @@ def test_only_the_report_depends_on_the_room_of_what_is_shown():
 
 
 def test_imports_inside_functions_and_of_the_package_count():
-    code = (
-        "import helpers.learning.lstm\ndef verb():\n    from helpers import quick\n    from helpers.plant.task import ControlTask\n"
-    )
+    inside = "    from helpers import quick\n    from helpers.plant.task import ControlTask\n"
     expected = {"helpers", "helpers.learning", "helpers.learning.lstm", "helpers.quick"}
     expected |= {"helpers.plant", "helpers.plant.task", "helpers.plant.task.ControlTask"}
-    assert set(sources._imported(code)) == expected
+    assert set(sources._imported(f"import helpers.learning.lstm\ndef verb():\n{inside}")) == expected

@@ -13,16 +13,16 @@ from safetensors.torch import save as save_tensors
 
 from helpers.learning.policy import LSTMPolicy
 from helpers.runs.artifacts import ArtifactError
-from helpers.runs.session import Session, open_session
+from helpers.runs.session import open_session
 from helpers.runs.sources import PROJECT
 from helpers.runs.study import cost, history_table, score_table, weight_table
 
 EPOCHS_OF_THE_PAPER = {1: (300, [10, 10]), 2: (250, [10, 10]), 3: (80, [10, 10])}
 COST = {"epochs", "episodes", "gradient_steps"}
 FEATURES = {"C_A-I", "T-I", "C_A-II", "T-II", "C_A-III", "T-III"}
-CONTROL = {"objective", "objective_x", "objective_y"}
+CONTROL = {"objective", "objective_x", "objective_y", "movement:C_A0", "movement:T_E"}
 CONTROL |= {f"{kind}:{loop}" for kind in ("overshoot", "offset", "rise_time") for loop in ("C_A", "T")}
-CONTROL |= {"movement:C_A0", "movement:T_E"} | {f"v:{name}{what}" for name in FEATURES for what in ("", ":std")}
+CONTROL |= {f"v:{name}{what}" for name in FEATURES for what in ("", ":std")}
 
 
 def session(case=1, variant="improved", scale="smoke", **given):
@@ -47,15 +47,13 @@ def learned():
 
 def test_demonstrations_are_what_notebook_01_recorded(learned):
     run, demonstrations, *_ = learned
-    assert demonstrations.trajectories.n_trajectories == run.scale_params.demonstrations
-    assert demonstrations.trajectories.n_steps == run.params.process.horizon
-    assert demonstrations.trajectories.x.dtype == run.dtype
+    found = demonstrations.trajectories
+    expected = (run.scale_params.demonstrations, run.params.process.horizon, run.dtype)
+    assert (found.n_trajectories, found.n_steps, found.x.dtype) == expected
     rows = pd.read_csv(run.folder(run.input_root, "demonstrations") / "scores.csv").set_index("metric")["value"]
-    assert demonstrations.true_features(run.feature_names).tolist() == pytest.approx(
-        [rows[f"v:{name}"] for name in run.feature_names]
-    )
     # The few recorded trajectories and the many fresh ones are of one controller.
     known, true = demonstrations.features(run.features), demonstrations.true_features(run.feature_names)
+    assert true.tolist() == pytest.approx([rows[f"v:{name}"] for name in run.feature_names])
     torch.testing.assert_close(known.double(), true.double(), rtol=0.15, atol=0)
 
 
@@ -63,18 +61,15 @@ def test_figures_of_merit_have_the_names_that_the_report_reads(learned):
     run, demonstrations, offline, online, _ = learned
     trajectories = run.fresh(offline.policy)
     imitation = run.judge_imitation(trajectories, demonstrations, offline)
-    expected = (
-        CONTROL | COST | {"feature_gap", "chosen_epoch"} | {f"{kind}:{name}" for kind in ("gap", "alpha") for name in FEATURES}
-    )
-    assert imitation.keys() == expected
+    of_features = {f"{kind}:{name}" for kind in ("gap", "alpha") for name in FEATURES}
+    assert imitation.keys() == CONTROL | COST | {"feature_gap", "chosen_epoch"} | of_features
     gaps = [abs(imitation[f"gap:{name}"]) for name in FEATURES]
     assert imitation["feature_gap"] == pytest.approx(sum(gaps) / len(gaps))
     assert sum(imitation[f"alpha:{name}"] ** 2 for name in FEATURES) == pytest.approx(1)
     improvement = run.judge(trajectories) | cost(online.records[-1])
     assert improvement.keys() == CONTROL | COST
     table = score_table({"offline": imitation, "online": improvement})
-    assert list(table) == ["stage", "metric", "value"]
-    assert len(table) == len(imitation) + len(improvement)
+    assert (list(table), len(table)) == (["stage", "metric", "value"], len(imitation) + len(improvement))
     assert table["value"].map(lambda value: isinstance(value, (int, float))).all()
 
 
@@ -100,9 +95,7 @@ def test_records_of_learning_become_tables(learned):
     assert (history[counted].diff().iloc[1:] > 0).all(axis=None)
     assert list(history_table(online.records, run.feature_names)["epochs"]) == [1, 2]
     weights = weight_table(run.feature_names, offline.weights)
-    assert dict(zip(weights["feature"], weights["alpha"], strict=True)) == dict(
-        zip(run.feature_names, offline.weights.tolist(), strict=True)
-    )
+    assert [weights["feature"].tolist(), weights["alpha"].tolist()] == [run.feature_names, offline.weights.tolist()]
 
 
 def test_every_controller_meets_the_same_disturbances(learned):
@@ -115,25 +108,23 @@ def test_every_controller_meets_the_same_disturbances(learned):
 def test_a_policy_comes_with_its_weights_also_from_another_case():
     run = session(case=3)
     policy, weights = run.load_policy("offline_improved", "02_offline_irl", 1)
-    assert isinstance(policy, LSTMPolicy)
     rows = pd.read_csv(run.folder(run.input_root, "offline_improved", 1) / "weights.csv").set_index("feature")["alpha"]
-    assert weights.tolist() == [rows[name] for name in run.feature_names]
+    assert (type(policy), weights.tolist()) == (LSTMPolicy, [rows[name] for name in run.feature_names])
 
 
-@pytest.mark.parametrize(
-    ("verb", "given"), [(Session.load_demonstrations, ()), (Session.load_policy, ("offline_improved", "02_offline_irl"))]
-)
-def test_a_missing_upstream_result_names_file_and_notebook(tmp_path, verb, given):
-    with pytest.raises(ArtifactError, match=r"record\.json: this result is missing; run 0[12]_[a-z_]* for case 1 first"):
-        verb(session(input_root=str(tmp_path)), *given)
+def test_a_missing_upstream_result_names_file_and_notebook(tmp_path):
+    run, says = session(input_root=str(tmp_path)), r"record\.json: this result is missing; run {} for case 1 first"
+    with pytest.raises(ArtifactError, match=says.format("01_demonstrations")):
+        run.load_demonstrations()
+    with pytest.raises(ArtifactError, match=says.format("02_offline_irl")):
+        run.load_policy("offline_improved", "02_offline_irl")
 
 
 @pytest.mark.parametrize(("case", "variant"), [(1, "improved"), (3, "printed")])
 def test_what_was_spent_stays_within_the_budget(learned, case, variant):
     run, _, offline, online, _ = learned if (case, variant) == (1, "improved") else learn(case, variant)
     epochs, rounds = EPOCHS_OF_THE_PAPER[case]
-    budget = run.scale_params.episodes + run.scale_params.measured
-    share = run.scale_params.epoch_share
+    budget, share = run.scale_params.episodes + run.scale_params.measured, run.scale_params.epoch_share
     assert budget <= 500
     for records, parts in ((offline.records, [epochs]), (online.records, rounds)):
         assert records[-1].epochs <= sum(max(1, round(part * share)) for part in parts)

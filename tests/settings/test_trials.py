@@ -1,6 +1,5 @@
 """Trials of offline learning: what trials.yaml makes of a variant, what it must not touch, and its refusals."""
 
-from collections import Counter
 from typing import get_args
 
 import pytest
@@ -13,29 +12,42 @@ from tests.runs.test_study import session
 from tests.settings.test_params import DELETE, edit, folder, leaf, refusal  # noqa: F401  (a fixture)
 
 TRIALS = "trials.yaml"
+MANY = leaf(41, "per pass")
+OF_A_TRIAL = [("base", "best", "improved, printed"), ("base", "whole_return", "improved, printed"), ("base", DELETE, "missing")]
+OF_A_TRIAL += [("title", "", "1 character"), ("family", "luck", "step size"), ("policy", {}, "unknown")]
+OF_A_TRIAL += [("learner", 3, "keys and values"), ("learner.learning_rate_end", 0.1, "value, unit, source, status")]
+OF_A_TRIAL += [
+    ("learner.learning_rate_end", leaf(2.0), "less than or equal to 1"),
+    ("learner.learning_rate_end", leaf(0.1, "s"), "unit"),
+]
+OF_A_TRIAL += [("learner.rate", leaf(0.1), "unknown"), ("learner.minibatches", MANY, "40 episodes")]
+OF_A_TRIAL += [("learner.entropy", leaf(-0.1), "greater than or equal to 0")]
+REFUSED = [
+    *(({f"constant_step.{key}": value}, f"constant_step.{key}", says) for key, value, says in OF_A_TRIAL),
+    ({"constant_step.learner": DELETE}, "constant_step", "changes nothing"),
+    ({"improved": {"base": "printed", "title": "a", "family": "credit", "weights": {"step": leaf(0.1)}}}, "improved", "other than"),
+    ({"variants": {"best": {"weights": {}}}}, "variants.best", "improved, printed"),
+    ({"variants": {"printed": 3}}, "variants.printed", "keys and values"),
+    ({"variants": {"printed": {"weights": {"pace": leaf(0.1)}}}}, "variants.printed.weights.pace", "unknown"),
+    ({"variants": {"printed": {"learner": {"minibatches": MANY}}}}, "variants.printed.learner.minibatches", "40 episodes"),
+]
 
 
 def test_every_family_has_a_trial_and_every_trial_a_title_of_its_own(root):
-    trials = load_trials(root)
-    families = Counter(trial.family for trial in trials.values())
-    assert set(families) == set(get_args(TrialParams.model_fields["family"].annotation))
-    assert len({trial.title for trial in trials.values()}) == len(trials)
-    assert max(len(trial.title) for trial in trials.values()) <= 70
-    assert {trial.base for trial in trials.values()} == {"improved"}
+    trials = load_trials(root).values()
+    assert {trial.family for trial in trials} == set(get_args(TrialParams.model_fields["family"].annotation))
+    assert len({trial.title for trial in trials}) == len(trials)
+    assert max(len(trial.title) for trial in trials) <= 70
+    assert {trial.base for trial in trials} == {"improved"}
 
 
 def test_a_trial_is_its_base_but_for_the_leaves_that_the_file_names(root):
     variants = load(root, 1).learning.variants
     for name, entry in read_yaml(root / TRIALS).items():
         found, base = variants[name].model_dump(), variants["improved"].model_dump()
-        changed = {
-            (part, key): value
-            for part in ("learner", "weights")
-            for key, value in (found[part] or {}).items()
-            if value != (base[part] or {}).get(key)
-        }
-        given = {(part, key): leaf["value"] for part in ("learner", "weights") for key, leaf in entry.get(part, {}).items()}
-        assert changed == given, name
+        for part in ("learner", "weights"):
+            given = {key: leaf["value"] for key, leaf in entry.get(part, {}).items()}
+            assert {key: value for key, value in found[part].items() if value != base[part][key]} == given, name
 
 
 def test_trials_leave_the_variants_the_leaves_and_their_hash_alone_which_changes_with_values_only(folder, root):  # noqa: F811
@@ -62,30 +74,6 @@ def test_a_case_may_change_a_variant_and_no_other_case_sees_it(folder, root):  #
     assert own.variants["improved"] == expected
     assert other.variants["improved"] == improved
     assert own.variants["constant_step"] == before.variants["constant_step"]  # a trial changes the variant of learning.yaml
-
-
-MANY = leaf(41, "per pass")
-REFUSED = [
-    ({"constant_step.base": "best"}, "constant_step.base", "improved, printed"),
-    ({"constant_step.base": "whole_return"}, "constant_step.base", "improved, printed"),
-    ({"constant_step.base": DELETE}, "constant_step.base", "missing"),
-    ({"constant_step.title": ""}, "constant_step.title", "1 character"),
-    ({"constant_step.family": "luck"}, "constant_step.family", "step size"),
-    ({"constant_step.policy": {}}, "constant_step.policy", "unknown"),
-    ({"constant_step.learner": 3}, "constant_step.learner", "keys and values"),
-    ({"constant_step.learner": DELETE}, "constant_step", "changes nothing"),
-    ({"constant_step.learner.learning_rate_end": 0.1}, "constant_step.learner.learning_rate_end", "value, unit, source, status"),
-    ({"constant_step.learner.learning_rate_end.value": 2.0}, "constant_step.learner.learning_rate_end", "less than or equal to 1"),
-    ({"constant_step.learner.learning_rate_end.unit": "s"}, "constant_step.learner.learning_rate_end", "unit"),
-    ({"constant_step.learner.rate": leaf(0.1)}, "constant_step.learner.rate", "unknown"),
-    ({"constant_step.learner.minibatches": MANY}, "constant_step.learner.minibatches", "40 episodes"),
-    ({"constant_step.learner.entropy": leaf(-0.1)}, "constant_step.learner.entropy", "greater than or equal to 0"),
-    ({"improved": {"base": "printed", "title": "a", "family": "credit", "weights": {"step": leaf(0.1)}}}, "improved", "other than"),
-    ({"variants": {"best": {"weights": {}}}}, "variants.best", "improved, printed"),
-    ({"variants": {"printed": 3}}, "variants.printed", "keys and values"),
-    ({"variants": {"printed": {"weights": {"pace": leaf(0.1)}}}}, "variants.printed.weights.pace", "unknown"),
-    ({"variants": {"printed": {"learner": {"minibatches": MANY}}}}, "variants.printed.learner.minibatches", "40 episodes"),
-]
 
 
 @pytest.mark.parametrize(("changes", "key", "says"), REFUSED, ids=[f"{key} {says}" for _, key, says in REFUSED])
